@@ -66,7 +66,8 @@ def forms(effect: Effect, values: Mapping[str, Array]) -> Iterator[Effect]:
             shares = np.linspace(0.0, 1.0, count + 1)
             knots = np.quantile(used, shares**2 if over in SIZES else shares)
             knots[0] = 0.0 if over in SIZES else knots[0]
-            if np.all(np.diff(knots) > 0.0):
+            # Steps of an encoder may hold several quantiles, with an interval between that no curve is sampled in.
+            if np.all(np.diff(knots) > 2.0 * (knots[-1] - knots[0]) / POINTS):
                 yield effect.model_copy(update={"over": over, "knots": tuple(knots.tolist())})
 
 

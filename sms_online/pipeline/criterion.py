@@ -61,26 +61,29 @@ class Columns:
     gains: tuple[int, ...]
     inertial: NDArray[np.bool_]
 
-    def groups(self, torque: bool) -> list[NDArray[np.bool_]]:
-        """Columns (m + n + 1,) that share their error, in rows with a torque and in others.
+    def sharing(self, torque: bool) -> NDArray[np.bool_]:
+        """Which columns (m + n + 1,) of rows with a torque, or of others, share their error.
 
-        All inertial forces follow from the same accelerations, and may cancel each other. A torque and its gain are one
-        force; where it is of a known gain, it is all that is wrong.
+        All inertial forces follow from the same accelerations, and may cancel each other. Where a torque is, it is all
+        that is wrong, with its gain.
         """
+        if not torque:
+            return np.append(self.inertial, False)
         own = np.zeros(self.inertial.size + 1, dtype=np.bool_)
         own[[*self.gains, -1]] = True
-        return [own] if torque else [np.append(self.inertial, False), own]
+        return own
 
     @property
     def apart(self) -> NDArray[np.bool_]:
         """Which (m + n + 1,) have an error of their own in rows without a torque. Nuisances have none."""
         forces = np.arange(self.inertial.size + 1) >= self.nuisances
-        return np.asarray(forces & ~np.any(self.groups(torque=False), axis=0))
+        return np.asarray(forces & ~self.sharing(torque=False))
 
     def same(self, torque: bool) -> NDArray[np.bool_]:
         """Which pairs (m + n + 1, m + n + 1) have the same error."""
-        pairs = np.any([np.outer(group, group) for group in self.groups(torque)], axis=0)
-        return np.asarray(pairs if torque else pairs | np.diag(self.apart))
+        sharing = self.sharing(torque)
+        pairs = np.outer(sharing, sharing)
+        return pairs if torque else pairs | np.diag(self.apart)
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,7 @@ class Criterion:
         m = grams.nuisances
         self._noisy_columns = slice(m, None)
         # What the model lacks is an error of these columns.
-        self._wrong = np.flatnonzero(np.any(columns.groups(torque=False), axis=0) | columns.apart)
+        self._wrong = np.flatnonzero(columns.sharing(torque=True) | columns.sharing(torque=False) | columns.apart)
         pairs = np.ix_(self._wrong, self._wrong)
         kinds = np.array([columns.same(torque=kind)[pairs] for kind in (False, True)])
         beyond = signal[lacking]
@@ -265,10 +268,11 @@ class Criterion:
         signal, noise = grams.block_diagonals()
         signal[..., m:] -= noise
         out = np.where(~torque & columns.apart, signal * w, 0.0)
-        for group, rows in zip(columns.groups(torque=False), (~torque, np.ones_like(torque)), strict=True):
-            signal, noise = grams.block_products(np.where(group, w, 0.0))
+        for kind in (True, False):
+            sharing = columns.sharing(kind)
+            signal, noise = grams.block_products(np.where(sharing, w, 0.0))
             signal[..., m:] -= noise
-            out += np.where(rows & group, signal, 0.0)
+            out += np.where((torque == kind) & sharing, signal, 0.0)
         return np.asarray(out[:, self._lacking])
 
 

@@ -37,7 +37,7 @@ class FirstWeights:
     """Finds β (n,) for m nuisances and n parameters.
 
     nominal (n,): described values. calibration (k, m + n + 1), columns, prior_information: as in `MomentumFit`.
-    torque, gained (n_v,): which speeds' rows hold a torque of known gain, and of unknown.
+    torque, gained (n_v,): which speeds' rows hold a torque, and which one whose gain is a parameter.
     """
 
     def __init__(

@@ -141,6 +141,9 @@ class JointEstimate(Stage):
         prior = None if self._within else self._prior
         known = np.pad(prior_factor(prior, self._n), ((0, 0), (len(self._nuisances), 0)))
         may = np.array([each.may_give_way for each in self._nuisances if np.isfinite(each.tolerance)], dtype=np.bool_)
+        if len(self._gains):
+            # They and a free gain could explain a torque between them.
+            may[:] = False
         bounds = bound_rows(self._nuisances, self._n)
         certain = np.concatenate((self.state.known, self._calibration[~may], bounds, known, self._gains))
         return PriorInformation(certain, self._calibration[may])

@@ -101,7 +101,7 @@ class MomentumFit(Stage):
     [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. prior_information: gives all that is known
     beside the rows. drift: gives the known drift in the window that ends at a grid index. point: gives the nuisances
     (m,) that samples are corrected by, none by default. whitening: that of now. torque (n_v,): which speeds' rows hold
-    a torque of known gain.
+    a torque.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class MomentumFit(Stage):
             else lambda: PriorInformation.none(self._nuisances + base.n)
         )
         self._gained = gained(model)
-        self.torque = np.isin(np.arange(model.layout.n_v), model.layout.theta_m) & ~self._gained
+        self.torque = np.isin(np.arange(model.layout.n_v), model.layout.theta_m)
         nominal = base.values(model.nominal)
         self._first_weights = FirstWeights(
             nominal, self._calibration, self.columns, self.torque, self._gained, self._prior_information
