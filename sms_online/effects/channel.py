@@ -17,8 +17,8 @@ from sms_online.stream import Array
 
 # Fixed-point steps from a reading back to the angle; the error falls by the amplitude (rad) each.
 INVERSIONS = 20
-# A disc's centre is off by a tenth of its radius at most.
-LARGEST_ECCENTRICITY = 0.1
+# A disc's centre is off by a twentieth of its radius at most.
+LARGEST_ECCENTRICITY = 0.05
 # A zero further off than a turn is no zero: such a size fits where the offset acts on next to nothing.
 LARGEST_OFFSET = 2.0 * np.pi  # rad (m)
 
