@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from sms_online.calibration.columns import nuisances
 from sms_online.capture import check_channels
 from sms_online.cramer_rao import MotionRecord
 from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import System
 from sms_online.diagnosis.evidence import RANK_TOLERANCE
-from sms_online.effects.catalogue import ENTRIES
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import BaseParameters
@@ -106,22 +106,28 @@ class Validation(Tabled):
 
 
 def validate(
-    system: System, data: Data, parameters: Result | Parameters | Mapping[str, float] | None = None
+    system: System,
+    data: Data,
+    parameters: Result | Parameters | Mapping[str, float] | None = None,
+    gains: Mapping[str, float] | None = None,
 ) -> Validation:
     """Predict the torques of recorded data with fixed parameters, and measure the error.
 
-    data: as for `estimate`. parameters: values by name, or a `Result`, whose gains of torques hold as its parameters
-    do; the nominal ones of the system file unless given. Nothing is estimated from the data but for comparison.
+    data: as for `estimate`. parameters: values by name, or those of a `Result`; the nominal ones of the system file
+    unless given. gains: share by which the torques of some joints, by name, are read too large; those that a `Result`
+    has found unless given. Nothing is estimated from the data but for comparison.
     Raises InputError where the data do not fit the system, a parameter is missing, or there is no torque to predict.
     """
     if isinstance(parameters, Result):
-        gains = {each.where: each.estimate for each in parameters.calibration if each.name == GAIN}
-        values = {name: each.value for name, each in parameters.parameters.items()}
-        system, parameters = with_gains(system, values, gains)
+        found = {each.where: each.estimate for each in parameters.calibration if each.name == GAIN}
+        gains, parameters = found if gains is None else gains, parameters.parameters
     recorded = recorded_session(system, data)
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     # The rows of the joints' torques depend on no estimate; without a momentum balance no event changes the model.
     session = Estimator(system.model_copy(update={"balance": "energy"}), recorded.source.channels, recorded.name)
+    session.energy.begin_joints(session.model, session.base, session.sensing)
+    gains = gains or {}
+    held = [gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in nuisances(session.sensing)]
     motion = MotionRecord(system.sample_rate)
     session.observers.append(motion)
     for block in recorded.source:
@@ -131,26 +137,11 @@ def validate(
     sums = {joint_rows(i): each for i, each in enumerate(session.energy.joint_residuals) if each.signal > 0.0}
     if not sums:
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
-    fitted = _fitted(list(sums.values()), beta, gain_columns(session.model, session.base, ()))
-    joints = {name: Predicted(_share(each, beta), _share(each, fitted)) for name, each in sums.items()}
+    known = np.array(held)
+    fitted = _fitted(list(sums.values()), beta, known, gain_columns(session.model, session.base, ()))
+    joints = {name: Predicted(_share(each, beta, known), _share(each, fitted, known)) for name, each in sums.items()}
     warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
     return Validation(system.name, session.duration, joints, warnings)
-
-
-def with_gains(
-    system: System, values: Mapping[str, float], gains: Mapping[str, float]
-) -> tuple[System, dict[str, float]]:
-    """System and values by name, with gains of torques that a session has found, by joint: declared as effects."""
-    declared, held = [], {effect.key for effect in system.effects}
-    (entry,) = (each for each in ENTRIES.values() if GAIN in each.traits.calibrates)
-    (coefficient,) = entry.coefficients
-    for where, gain in gains.items():
-        # A measured torque is too large by its gain; an effect says what it has to be multiplied by.
-        effect = Effect(name=entry.name, where=where, coefficients={coefficient: -gain})
-        if effect.key not in held:
-            declared.append(effect)
-    added = {f"{effect.key}.{name}": value for effect in declared for name, value in effect.coefficients.items()}
-    return system.model_copy(update={"effects": (*system.effects, *declared)}), {**values, **added}
 
 
 def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
@@ -161,8 +152,8 @@ def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
     return [said for effect in model.effects if (said := effect.beyond(model.layout, x, v))]
 
 
-def _share(sums: SquaredResidual, beta: Array) -> float:
-    share = sums.relative(beta)
+def _share(sums: SquaredResidual, beta: Array, known: Array) -> float:
+    share = sums.relative(beta, known)
     assert share is not None
     return share
 
@@ -178,17 +169,17 @@ def _values(base: BaseParameters, system: System, parameters: Parameters | Mappi
     return np.array([values[parameter.name] for parameter in base.parameters])
 
 
-def _fitted(sums: list[SquaredResidual], beta: Array, held: Sequence[int]) -> Array:
+def _fitted(sums: list[SquaredResidual], beta: Array, known: Array, gains: Sequence[int]) -> Array:
     """β (n,) that leaves least of all joints' torques, each relative to its own.
 
-    held: gains of torques, which stay those of beta (n,): a free one would make a torque vanish.
+    known (m,): nuisances. gains: parameters that stay those of beta (n,): a free one would make a torque vanish.
     """
-    gram, n = np.sum([each.gram / each.signal for each in sums], axis=0), beta.size
-    free = np.setdiff1d(np.arange(n), held)
+    gram = np.sum([each.gram / each.signal for each in sums], axis=0)
+    w, free = sums[0].unknowns(beta, known), np.setdiff1d(np.arange(beta.size), gains)
+    fixed = np.setdiff1d(np.arange(w.size), free)
     size = np.sqrt(np.diag(gram))[free]
     size[size == 0.0] = 1.0
     scaled = gram[np.ix_(free, free)] / np.outer(size, size)
-    known = gram[free, -1] - gram[np.ix_(free, np.array(held, dtype=int))] @ beta[list(held)]
-    out = beta.copy()
-    out[free] = np.linalg.lstsq(scaled, known / size, rcond=RANK_TOLERANCE)[0] / size
-    return out
+    known_part = -gram[np.ix_(free, fixed)] @ w[fixed]
+    w[free] = np.linalg.lstsq(scaled, known_part / size, rcond=RANK_TOLERANCE)[0] / size
+    return w[: beta.size]

@@ -10,7 +10,6 @@ import pytest
 import sms_online as sms
 from sms_online.calibration.found import Calibration
 from sms_online.description.schema import Effect, System
-from sms_online.validation import with_gains
 
 GAIN = 0.04
 # A rigid arm on a table. What its second joint's torque says of link 2 is little beside friction: with a free gain all
@@ -131,11 +130,25 @@ def test_gains_that_a_session_finds_hold_on_another_run(arm: System) -> None:
     result = sms.estimate(arm, run)
     values = {name: parameter.true or 0.0 for name, parameter in result.parameters.items()}
     without = sms.validate(arm, run, values).joints["joint_2"].left
-    system, gained = with_gains(arm, values, {"joint_2": -GAIN})
-    held = sms.validate(system, run, gained)
+    held = sms.validate(arm, run, values, {"joint_2": -GAIN})
     assert held.holds
     assert held.joints["joint_2"].left < 0.1 * without
     found = Calibration("drive_gain", "joint_2", "against joint_1", "", -GAIN, 1e-3, 1e-2)
     handed_on = sms.validate(arm, run, replace(result, calibration=(found,)))
     plain = sms.validate(arm, run, replace(result, calibration=()))
     assert handed_on.joints["joint_2"].left != plain.joints["joint_2"].left
+
+
+@pytest.mark.slow
+def test_the_gain_of_joint_1_is_held_where_the_scale_is_fixed(arm: System) -> None:
+    """A torque of joint 1 that reads 4 % too large, and a result that says so."""
+    system = arm.model_copy(update={"known": {"motor_2.rotor_inertia": 2.4e-5}})
+    run = sms.simulate(arm)
+    columns = dict(zip(run.channels, run.values.T.copy(), strict=True))
+    columns["tau_1"] *= 1.0 / (1.0 - GAIN)
+    read = sms.Capture.from_arrays(run.t, columns)
+    result = sms.estimate(system, run)
+    found = Calibration("drive_gain", "joint_1", "", "", GAIN, 1e-3, 1e-2)
+    held = sms.validate(system, read, replace(result, calibration=(found,))).joints["joint_1"]
+    plain = sms.validate(system, read, replace(result, calibration=())).joints["joint_1"]
+    assert held.left < 0.1 * plain.left

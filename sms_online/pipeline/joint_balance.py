@@ -58,12 +58,16 @@ class SquaredResidual(State):
         """
         if self.signal == 0.0:
             return None
+        w = self.unknowns(beta, nuisances)
+        return float(np.sqrt(max(0.0, float(w @ self.gram @ w)) / self.signal))
+
+    def unknowns(self, beta: Array, nuisances: Array | None = None) -> Array:
+        """What multiplies the columns of `gram`: β (n,), nuisances (m,) of the session, zeros unless given, and -1."""
         turned, gained = np.zeros(len(self.deflections)), np.zeros(len(self.torques))
         if nuisances is not None and nuisances.size:
             stiffness = beta[self.spring] if self.spring >= 0 else 0.0
             turned, gained = -stiffness * nuisances[self.deflections], nuisances[self.torques]
-        w: Array = np.concatenate((beta, turned, gained, [-1.0]))
-        return float(np.sqrt(max(0.0, float(w @ self.gram @ w)) / self.signal))
+        return np.concatenate((beta, turned, gained, [-1.0]))
 
 
 class JointState(State):

@@ -115,9 +115,10 @@ class JointEstimate(Stage):
 
     def row_variance(self, fit: MomentumFit) -> float:
         """Mean square of what the rows leave, in units of their predicted variance."""
-        # Rows that leave more than noise are weighted by what they leave.
-        estimate = self.solved(fit) if self.scale_free(fit) is None else None
-        left = 1.0 if estimate is None else estimate.rss / max(estimate.dof, 1.0)
+        left = 1.0  # where rows are weighted by what they leave
+        if self.scale_free(fit) is None:
+            estimate = self.solved(fit)
+            left = estimate.rss / max(estimate.dof, 1.0)
         return left * (1.0 + float(fit.plain.misfit.mean()))
 
     def scale_free(self, fit: MomentumFit) -> ScaleFree | None:

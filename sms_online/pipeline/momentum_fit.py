@@ -300,7 +300,7 @@ class MomentumFit(Stage):
 
     @property
     def lacking(self) -> NDArray[np.bool_]:
-        """Which speeds' rows (n_v,) are weighted by what they leave: more than noise, or any share of a torque."""
+        """Which speeds' rows (n_v,) are weighted by what they leave: more than noise, or a torque of unknown gain."""
         return np.asarray((self.plain.misfit > 0.0) | self._gained)
 
     @property

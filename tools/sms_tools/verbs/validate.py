@@ -11,7 +11,7 @@ from sms_adapters.session_log import SYSTEM
 from sms_online.description.schema import System
 from sms_online.pipeline.torque_gains import GAIN
 from sms_online.recorded import Recorded
-from sms_online.validation import validate, with_gains
+from sms_online.validation import validate
 from sms_tools.exit_codes import OK
 from sms_tools.report import say, table
 from sms_tools.results_file import results_directory, write_document
@@ -19,23 +19,25 @@ from sms_tools.session import check_part, described_system
 from sms_tools.waiting import watched
 
 NAME = "validation.json"
+# Numbers by name.
+Values = dict[str, float]
 
 
 def run(args: argparse.Namespace) -> int:
     """Validate; 0, whether or not the parameters hold."""
     check_part(args)
-    system, parameters, folder = _described(args)
+    system, parameters, gains, folder = _described(args)
     directory = results_directory(args.out)
     with watched(args.capture, system, folder, args.start, args.stop) as reading:
-        found = validate(system, Recorded(reading, str(args.capture)), parameters)
+        found = validate(system, Recorded(reading, str(args.capture)), parameters, gains)
     path = write_document(directory / NAME, found.to_json())
     lines = [*(f"warning: {warning}" for warning in found.warnings), f"validation: {path}", "", found.sentence]
     say(args, table(*found.rows(), left=("joint",)), "", *lines, document=found.to_json())
     return OK
 
 
-def _described(args: argparse.Namespace) -> tuple[System, dict[str, float] | None, Path | None]:
-    """System and parameters of a results.json or of the folder of a run; of a system file its nominal values."""
+def _described(args: argparse.Namespace) -> tuple[System, Values | None, Values, Path | None]:
+    """System, parameters and gains of a results.json or of a run's folder; of a system file its nominal values."""
     path = Path(args.system)
     if path.is_dir() and (path / SYSTEM).exists() and not (path / RESULTS).exists():
         # The folder of a diagnosis.
@@ -43,8 +45,8 @@ def _described(args: argparse.Namespace) -> tuple[System, dict[str, float] | Non
         args.system = str(path)
     if path.suffix != ".json" and not path.is_dir():
         system, folder = described_system(args)
-        return system, None, folder
+        return system, None, {}, folder
     document = read_results(path)
     values = {parameter["name"]: float(parameter["estimate"]) for parameter in document["parameters"]}
     gains = {each["where"]: float(each["estimate"]) for each in document["calibration"] if each["name"] == GAIN}
-    return *with_gains(System.model_validate(document["system"]), values, gains), None
+    return System.model_validate(document["system"]), values, gains, None
