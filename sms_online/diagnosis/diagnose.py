@@ -172,7 +172,7 @@ def diagnose(
 
 
 def _first(case: Case, system: System) -> tuple[Case, Attempt]:
-    """The system against a case's samples, and the case with what is use_prior.
+    """The system against a case's samples, and the case, with the prior or without it.
 
     Rows that leave more than noise whatever is added contradict what is known beforehand, and effects that there are
     not would reconcile the two: what they lack is searched by what they say alone.
