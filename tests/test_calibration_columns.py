@@ -33,6 +33,7 @@ ROUNDING = 1e-6  # N s and so on for a unit of a nuisance
 SYSTEMS: dict[str, Callable[[], System]] = {
     "planar": paper,
     "planar, exact links": lambda: paper("exact"),
+    "planar, sloping table": lambda: paper().model_copy(update={"gravity": (0.003, -0.002, 0.0)}),
     "spatial": lambda: load_system("spatial-two-link"),
     "flexible joints with gauges": lambda: load_system("quanser-2dsfl"),
     "spatial, prismatic joint, gravity, effects": lambda: spatial(free=False),
@@ -156,3 +157,20 @@ def test_a_mount_turned_about_its_joint_offsets_its_encoder() -> None:
         turned.append(rows.residual(rows.exact, rows.model.of_geometry(system)))
     expected = (turned[0] - turned[1]) / (2 * STEP)
     np.testing.assert_allclose(rows.columns[:, k], expected, atol=AGREEMENT * np.abs(expected).max())
+
+
+def test_a_sloping_table_may_slope_otherwise() -> None:
+    """Gravity in the plane is what a slope leaves of 9.8 m/s²; an upright plane holds all of it."""
+    planar = load_system("paper-planar")
+
+    def parts(*gravity: float) -> dict[str, Geometry]:
+        every = geometries(planar.model_copy(update={"gravity": gravity}))
+        return {each.nuisance.part: each for each in every if each.nuisance.name == "gravity"}
+
+    assert parts(0.0, 0.0, 0.0) == {}
+    assert list(parts(0.0, -9.81, 0.0)) == ["z"]
+    sloping = parts(0.003, -0.002, 0.0)
+    assert list(sloping) == ["z", "x", "y"]
+    tilted = planar.model_copy(update={"gravity": (0.003, -0.002, 0.0)})
+    np.testing.assert_allclose(sloping["x"].moved(tilted, 1e-3).gravity, [0.003, -0.002 + 9.78e-3, 0.0], atol=1e-7)
+    np.testing.assert_allclose(sloping["y"].moved(tilted, 1e-3).gravity, [0.003 - 9.78e-3, -0.002, 0.0], atol=1e-7)

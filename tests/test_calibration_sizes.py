@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sms_online as sms
 from sms_adapters.system_file import load_system
 from sms_online.calibration.columns import nuisances
 from sms_online.description.schema import Tolerances
 from sms_online.effects.build import build_model
 from sms_online.evaluation import NORMAL_95
+from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.sensing import Sensing
 from sms_sim.plant import Plant
 from tests.campaigns.calibration import SYSTEM, WITHIN, one_session
@@ -61,3 +63,16 @@ def test_a_zero_of_the_attitude_adds_to_what_is_on_the_base() -> None:
     assert known["tracked_point", "base", "y"] == pytest.approx(np.hypot(5e-4, 1e-3))
     assert known["axis", "joint_1", "z"] == pytest.approx(np.hypot(5e-4, 1e-3))
     assert known["axis", "joint_2", "z"] == 5e-4
+
+
+@pytest.mark.long
+def test_a_slope_stated_a_little_wrong_is_corrected() -> None:
+    """A table whose slope is stated 3 % wrong: it is a tolerance of gravity, and no parameter is off by it. Seed 3."""
+    planar = sms.load_system("paper-planar")
+    data = sms.simulate(planar.model_copy(update={"gravity": (0.003, -0.002, 0.0)}), duration=24.0, grade="B", seed=3)
+    result = sms.estimate(planar.model_copy(update={"gravity": (0.0031, -0.002, 0.0)}), data)
+    model = build_model(planar)
+    true = find_base_parameters(model).values(model.nominal)
+    for parameter, value in zip(result.parameters.values(), true, strict=True):
+        assert parameter.value == pytest.approx(value, abs=4.0 * parameter.std), parameter.name
+    assert result.trust.level == "trust"

@@ -21,6 +21,8 @@ from sms_online.stream import Array
 
 # Step of the differences that give derivatives, m or rad: 1e-6 of them is lost to curvature, less to rounding.
 STEP = 1e-6
+# Gravity at the equator, m/s², the least on the ground: what a plane does not hold of it lies across the plane.
+LEAST_GRAVITY = 9.78
 
 
 def same_readings(described: Model, moved: Model, x: Array, v: Array) -> tuple[Array, Array]:
@@ -109,10 +111,8 @@ def geometries(system: System) -> Iterator[Geometry]:
                 yield Geometry(nuisance, partial(_mount_turned, *where, axis))
     gravity = np.array(system.gravity)
     if gravity.any() and tolerances.gravity > 0.0:
-        about = [np.array([0.0, 0.0, 1.0])] if planar else [np.array(v) for v in np.linalg.svd(gravity[None])[2][1:]]
-        for k, vector in enumerate(about, start=1):
-            part = "z" if planar else f"direction {k}"
-            yield Geometry(Nuisance("gravity", "base", "rad", tolerances.gravity, part), _tilted(vector))
+        for part, about in _tilts(gravity, planar):
+            yield Geometry(Nuisance("gravity", "base", "rad", tolerances.gravity, part), _tilted(about, planar))
 
 
 def _with(records: tuple[object, ...], i: int, **changed: object) -> tuple[object, ...]:
@@ -142,9 +142,31 @@ def _mount_turned(records: str, i: int, axis: int, system: System, by: float) ->
     return system.model_copy(update={records: _with(every, i, mount_rotation=tuple(mount.as_rotvec().tolist()))})
 
 
-def _tilted(about: Array) -> Callable[[System, float], System]:
+def _tilts(gravity: Array, planar: bool) -> Iterator[tuple[str, Array]]:
+    """Names and axes of rotations that gravity may be off by; of a plane that is not upright its slope too."""
+    if not planar:
+        for k, vector in enumerate(np.linalg.svd(gravity[None])[2][1:], start=1):
+            yield f"direction {k}", np.asarray(vector)
+        return
+    yield "z", np.array([0.0, 0.0, 1.0])
+    if _across(gravity) > 0.0:
+        yield "x", np.array([1.0, 0.0, 0.0])
+        yield "y", np.array([0.0, 1.0, 0.0])
+
+
+def _across(gravity: Array) -> float:
+    """Gravity across the plane, m/s², of which a planar system states what lies in it."""
+    return float(np.sqrt(max(LEAST_GRAVITY**2 - float(gravity @ gravity), 0.0)))
+
+
+def _tilted(about: Array, planar: bool) -> Callable[[System, float], System]:
     def moved(system: System, by: float) -> System:
-        gravity = Rotation.from_rotvec(by * about).apply(np.array(system.gravity))
-        return system.model_copy(update={"gravity": tuple(gravity.tolist())})
+        gravity = np.array(system.gravity)
+        if planar:
+            gravity[2] = -_across(gravity)
+        turned = Rotation.from_rotvec(by * about).apply(gravity)
+        if planar:
+            turned[2] = 0.0
+        return system.model_copy(update={"gravity": tuple(turned.tolist())})
 
     return moved
