@@ -27,14 +27,14 @@ class LaterController:
 def changed_session(before: Simulation, after: System, change: float, duration: float) -> Block:
     """Exact samples of `before` up to `change` (s), then of the system `after` up to `duration` (s).
 
-    Positions and speeds are continuous: what is grasped moves with the tip already.
+    Positions and speeds are continuous: what is grasped moves with the tip already. Internal states begin at rest.
     """
     rate = after.sample_rate
     samples = round(change * rate) + 1
     start = exact_states(before, np.arange(samples) / rate)
     plant = Plant(after)
     plant.controller = LaterController(plant, change)  # type: ignore[assignment]
-    state = np.concatenate((start.x[-1], start.v[-1]))
+    state = plant.state(start.x[-1], start.v[-1])
     rest = duration - change
     solution = solve(plant.rate, state, rest, tolerance(plant), longest=LONGEST_STEP)
     end = exact_states(Simulation(plant, solution), np.arange(1, round(rest * rate) + 1) / rate)

@@ -10,7 +10,7 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import LEAST_SQUARES, Effect, System
-from sms_online.diagnosis.online import OnlineDiagnosis, refusal
+from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.online_search import Immediate
 from sms_online.diagnosis.searcher import Outcome, Request
 from sms_online.effects.build import build_model
@@ -262,17 +262,3 @@ def test_a_session_with_an_adopted_effect_resumes_to_the_bit() -> None:
 def test_pickled_statistics_say_the_same_after_an_adoption() -> None:
     estimator, _ = cogged(True)
     assert elsewhere(statistics_of(estimator)) == results_document(estimator, 0.0, [])
-
-
-def test_what_acts_before_the_balance_is_not_adopted_live() -> None:
-    """A constant of a channel, and an effect with a state of its own, say why."""
-    (named,) = cogged(True)[1].episodes[0].named
-    model = build_model(PLANAR)
-
-    def as_if(name: str, where: str) -> str | None:
-        effect = Effect(name=name, where=where)
-        return refusal(model, (type(named)(effect, (), (), np.empty(0), np.empty(0), {}, 0.0, 0.0, ()),))
-
-    assert "constant" in (as_if("sensor_lag", "q_1") or "")
-    assert "internal state" in (as_if("torsional_hysteresis", "joint_1") or "")
-    assert as_if("air_drag", "base") is None

@@ -319,7 +319,7 @@ def test_noise_is_estimated_from_own_samples_at_any_rate(rate: float, grid: floa
         estimate.push(times, block)
     assert estimate.ready
     rates = {"force_1": grid, "q_1": rate}
-    noise = estimate.noise(np.array([1.0 / rates[name] for name in sensing.channels]))
+    noise = estimate.noise(np.array([1.0 / rates[name] for name in sensing.channels]), sensing.model.system)
     np.testing.assert_allclose(noise.sensors, sigma**2 / rate, rtol=0.3)
     np.testing.assert_allclose(noise.torque, 0.5**2 / grid, rtol=0.3)
     assert not noise.exact

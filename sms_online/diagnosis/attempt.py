@@ -13,7 +13,7 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, is_constant
+from sms_online.diagnosis.constants import corrected, is_constant
 from sms_online.diagnosis.evidence import together
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.followed import least_samples
@@ -22,7 +22,7 @@ from sms_online.diagnosis.record import LONGEST, Segment, bounded, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.effects.build import build_model
+from sms_online.effects.build import build_model, with_effects
 from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.estimator import Estimator
@@ -177,7 +177,7 @@ class Attempt(Hypothesis):
         """
         self.case, self.system = case, system
         session = case.session
-        described = applied(system, constants)
+        described = with_effects(system, constants)
         same = described == session.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
         self._known = case.prior(estimator)
@@ -280,7 +280,7 @@ class Attempt(Hypothesis):
 
     def adopted(self, chosen: Sequence[int]) -> System:
         """The described system with everything that was found."""
-        described = applied(self.system, self.constants)
+        described = with_effects(self.system, self.constants)
         effects = [self.tracing.candidates[k].effect for k in chosen]
         return described.model_copy(update={"effects": (*described.effects, *effects)})
 

@@ -6,7 +6,7 @@ linear in both. Their columns are first-order approximations: constants are impr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.record import Segment
@@ -34,13 +34,6 @@ def possible(effect: Effect, sample_rate: float) -> bool:
 def deviations(effect: Effect, covariance: Array) -> dict[str, float]:
     """1σ of the constants for the covariance (c, c) of the linear coefficients."""
     return CONSTANTS[effect.name].deviations(effect.coefficients, covariance)
-
-
-def applied(system: System, constants: Iterable[Effect]) -> System:
-    """The system with constants: effects on channels declared, a tilt in its gravity."""
-    for effect in constants:
-        system = CONSTANTS[effect.name].declared(system, effect)
-    return system
 
 
 def corrected(system: System, channels: Sequence[str], segment: Segment) -> Segment:

@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.constants import applied, corrected, is_constant
 from sms_online.diagnosis.episodes import Episode, Evidence, discrepancy, episode_document, line
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import Segment, joined
 from sms_online.diagnosis.searcher import Named, Outcome, Request, Searcher
-from sms_online.effects.build import changed_model
-from sms_online.effects.catalogue import ENTRIES
+from sms_online.effects.build import with_effects
 from sms_online.model.model import Model
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
@@ -103,9 +101,7 @@ class OnlineDiagnosis(Observer):
         for effect in found:
             if effect.key not in held:
                 fresh.setdefault(effect.key, effect)
-        forces = [effect for effect in fresh.values() if not is_constant(effect)]
-        declared = system.model_copy(update={"effects": (*system.effects, *forces)})
-        return applied(declared, [effect for effect in fresh.values() if is_constant(effect)])
+        return with_effects(system, fresh.values())
 
     @property
     def notices(self) -> list[str]:
@@ -292,11 +288,8 @@ class OnlineDiagnosis(Observer):
         for each in joined(self._record).values():
             inside: NDArray[np.bool_] = (each.index >= first) & (True if last is None else each.index <= last)
             if int(inside.sum()) > least_samples(self._estimator.system):
-                out.append(self._corrected(Segment(each.index[inside], each.values[inside])))
+                out.append(Segment(each.index[inside], each.values[inside]))
         return out
-
-    def _corrected(self, segment: Segment) -> Segment:
-        return corrected(self._estimator.system, self._estimator.sensing.channels, segment)
 
     def _hear(self, evidence: Evidence) -> None:
         """Take the answer of a search."""
@@ -354,45 +347,46 @@ class OnlineDiagnosis(Observer):
         """Go on with what was named."""
         onset, estimator = self._onset, self._estimator
         assert onset is not None
-        episode.refused = refusal(estimator.model, outcome.named)
+        episode.refused = refusal(estimator.model)
         if episode.refused is not None:
             return
         first, known = onset.first, onset.known
         if not outcome.began or onset.last is None:
             first, known = self._valid, self._momentum.changes.beforehand
         last = self._record[-1].segment
-        newest = self._corrected(joined(self._record)[last])
+        newest = joined(self._record)[last]
         late = newest.index >= first
         samples = GridSamples(newest.index[late], newest.values[late], last)
         time = self._time(int(samples.index[0])) if episode.began is None or not outcome.began else episode.began
+        sizes = {name: size for named in outcome.named for name, size in _sizes(named).items()}
         event = Event(
             time=time,
             kind="effect",
-            parameters=tuple(name for named in outcome.named for name in named.parameters),
-            units=tuple(unit for named in outcome.named for unit in named.units),
-            sizes=tuple(float(value) for named in outcome.named for value in named.values),
-            stds=tuple(float(std) for named in outcome.named for std in named.stds),
+            parameters=tuple(sizes),
+            units=tuple(unit for _, _, unit in sizes.values()),
+            sizes=tuple(value for value, _, _ in sizes.values()),
+            stds=tuple(std for _, std, _ in sizes.values()),
             dropped_windows=0,
         )
         weights = np.concatenate((outcome.beta, *(named.values for named in outcome.named)))
         effects = [named.effect for named in outcome.named]
-        estimator.adopt(self._momentum.changes.adopt(effects, event, known, weights, samples))
+        estimator.adopt(effects, event, known, weights, samples)
         self._events = len(estimator.events)
         self._valid = int(samples.index[0])
         episode.adopted = self._now
 
 
-def refusal(model: Model, named: tuple[Named, ...]) -> str | None:
-    """Why effects cannot be added while a session runs, None where they can: stages before the balance stay."""
-    channels = [effect for effect in model.system.effects if ENTRIES[effect.name].kind == "channel"]
-    if channels or model.n_states:
-        return "no update of a model that declares effects on channels or with internal states"
-    for each in named:
-        if is_constant(each.effect):
-            return f"{each.key} is a constant of the description"
-        with_it = changed_model(
-            model, model.system.model_copy(update={"effects": (*model.system.effects, each.effect)})
-        )
-        if with_it.n_states:
-            return f"{each.key} has an internal state, which is followed from a session's start alone"
+def _sizes(named: Named) -> dict[str, tuple[float, float, str]]:
+    """Value, 1σ and unit of each parameter of an effect, or of each constant where it has none."""
+    if named.parameters:
+        read = zip(named.values.tolist(), named.stds.tolist(), named.units, strict=True)
+        return dict(zip(named.parameters, read, strict=True))
+    said = named.coefficients.items()
+    return {f"{named.key}.{name}": (value, std, unit) for name, (value, std, unit) in said if std is not None}
+
+
+def refusal(model: Model) -> str | None:
+    """Why a model cannot be updated while a session runs, None where it can."""
+    if model.n_states:
+        return "its effects have internal states, which are followed from a session's start alone"
     return None

@@ -15,9 +15,10 @@ import numpy as np
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate import Candidate, Unmodelled
 from sms_online.diagnosis.candidates import CandidateColumns
-from sms_online.diagnosis.constants import applied, corrected, improved, is_constant, possible
+from sms_online.diagnosis.constants import corrected, improved, is_constant, possible
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.hypothesis import (
+    CORRECTIONS,
     LARGEST_SHARE_LEFT,
     REWEIGHED,
     Hypothesis,
@@ -32,7 +33,7 @@ from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.searcher import Named, Outcome, Request
 from sms_online.diagnosis.weak_windows import WeakWindows
-from sms_online.effects.build import build_model
+from sms_online.effects.build import build_model, with_effects
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -129,10 +130,33 @@ def _search(request: Request) -> Outcome | None:
         # Hardly anything was known of the rows' noise, for nothing explained the torques.
         rows.reweight(outcome.beta)
         outcome = _trace(request, _hypothesis(request, rows, everything, request.late), everything, request.late)
+    if any(_needs_masses(named.effect) for named in outcome.named) and not outcome.ended:
+        everything = _with_masses(request, rows, everything, outcome)
+        outcome = _trace(request, _hypothesis(request, rows, everything, request.late), everything, request.late)
     if outcome.verdict != "unexplained" or request.late == 0 or outcome.ended:
         return outcome
     always = _trace(request, _hypothesis(request, rows, everything, 0), everything, 0)
     return always if always.verdict == "named" or always.left < outcome.left else outcome
+
+
+def _needs_masses(effect: Effect) -> bool:
+    return is_constant(effect) and ENTRIES[effect.name].kind != "channel"
+
+
+def _with_masses(
+    request: Request, rows: SessionRows, everything: Sequence[Candidate], outcome: Outcome
+) -> list[Candidate]:
+    """Candidates, with columns that hold masses as these are beside what was named: a tilt's are linear in them."""
+    make = LateColumns(rows, request.model.system, request.late)
+    beta = outcome.beta
+    for _ in range(CORRECTIONS):
+        rows.reweight(beta)
+        named = [make.of(each.effect) for each in outcome.named]
+        some = Hypothesis(make, named, _folds(rows, request.late), request.prior)
+        some.tracing.reweight(some.everything)
+        beta = some.solution(some.everything)[: rows.base.n]
+    rows.reweight(beta)
+    return [make.of(each.effect) if _needs_masses(each.effect) else each for each in everything]
 
 
 def _of_late(found: LateSensor, request: Request) -> Outcome:
@@ -164,7 +188,7 @@ def _bounded(request: Request) -> Request:
 def _rows(request: Request, beta: Array, late: int = 0, constants: Sequence[Effect] = ()) -> SessionRows:
     """Rows of the record, the late segments free of what these constants do to channels."""
     system, channels = request.model.system, request.sensing.channels
-    described = applied(system, constants)
+    described = with_effects(system, constants)
     segments = [
         corrected(described if number >= late else system, channels, segment)
         for number, segment in enumerate(request.segments)
@@ -250,7 +274,7 @@ def _corrected(request: Request, some: Hypothesis, chosen: Sequence[int], late: 
 
     def trial(constants: Sequence[Effect], beta: Array) -> Hypothesis:
         rows = _rows(request, beta, late, constants)
-        make = LateColumns(rows, applied(request.model.system, constants), late)
+        make = LateColumns(rows, with_effects(request.model.system, constants), late)
         trial = Hypothesis(make, [make.of(force) for force in forces], _folds(rows, late), request.prior, constants)
         trial.tracing.reweight(trial.everything)
         return trial

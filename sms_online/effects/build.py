@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 
 import numpy as np
 
 from sms_online.description.bodies import FlexibleLink
-from sms_online.description.schema import System
+from sms_online.description.schema import Effect, System
 from sms_online.description.tree import index_of
 from sms_online.effects.base import Site
-from sms_online.effects.catalogue import FORCE_CLASSES, GEOMETRIC_STIFFENING, INERTIA_CLASSES, check_effect, with_shapes
+from sms_online.effects.catalogue import (
+    CONSTANTS,
+    FORCE_CLASSES,
+    GEOMETRIC_STIFFENING,
+    INERTIA_CLASSES,
+    check_effect,
+    with_shapes,
+)
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import fixes_scale
 from sms_online.model.chain import Chain
@@ -52,12 +59,30 @@ def refuse_unknown_masses(model: Model) -> None:
             raise InputError(model.system.name, place, found, expected)
 
 
-def changed_model(model: Model, system: System) -> Model:
-    """Model of a changed system, with the reference of `model` by the parameters' names; what is new has mass 0."""
-    reference = dict(zip((p.name for p in model.parameters), model.reference, strict=True))
+def changed_model(model: Model, system: System, masses: Mapping[str, float] | None = None) -> Model:
+    """Model of a changed system, with the reference of `model` by the parameters' names; what is new has mass 0.
+
+    masses: reference of these parameters in its place.
+    """
+    reference = dict(zip((p.name for p in model.parameters), model.reference, strict=True)) | dict(masses or {})
     other = build_model(system)
     other.reference = np.array([reference.get(p.name, 0.0) for p in other.parameters])
     return other
+
+
+def declaring(system: System, effects: Iterable[Effect]) -> System:
+    """The system with further effects declared."""
+    return system.model_copy(update={"effects": (*system.effects, *effects)})
+
+
+def with_effects(system: System, effects: Iterable[Effect]) -> System:
+    """The system with further effects: declared, or as constants of its description where they become such."""
+    effects = tuple(effects)
+    system = declaring(system, [effect for effect in effects if effect.name not in CONSTANTS])
+    for effect in effects:
+        if effect.name in CONSTANTS:
+            system = CONSTANTS[effect.name].declared(system, effect)
+    return system
 
 
 def with_kinematics(system: System) -> System:

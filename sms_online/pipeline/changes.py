@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import Nuisance, known_beforehand
 from sms_online.description.schema import Effect, TrackerChoice
-from sms_online.effects.build import changed_model
+from sms_online.effects.build import changed_model, declaring
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.drift_line import DriftLine
@@ -66,6 +66,7 @@ class ChangesState(State):
     index (B,), values (B, ·): samples of the last segment, as far back as windows are remembered. events: so far;
     added: names of the parameters that they have added, adopted: effects among these. clear: grid index from which on
     no sample is from before the event. wanted: windows after it that the next decision takes. shifts: of clocks.
+    reference: values of the model's parameters by name whose masses adopted effects act on.
     """
 
     index: NDArray[np.int64]
@@ -74,6 +75,7 @@ class ChangesState(State):
     shifts: list[ClockShift] = msgspec.field(default_factory=list)
     added: list[str] = msgspec.field(default_factory=list)
     adopted: tuple[Effect, ...] = ()
+    reference: dict[str, float] = msgspec.field(default_factory=dict)
     segment: int = -1
     clear: int = 0
     wanted: int = DECISION
@@ -329,16 +331,23 @@ class Changes(Stage):
     def adopt(
         self, effects: Sequence[Effect], event: Event, known: Information, weights: Array, samples: GridSamples
     ) -> Adoption:
-        """Go on with effects that the model lacked: forces without internal states, or a payload.
+        """Go on with effects that the model lacked.
 
-        event: what is reported of it; its parameters are the effects' own. known: from rows that they had no part
-        in. weights (n + c,): of the parameters, then the effects'. samples: those of the session's last segment that
-        hold the effects.
+        event: what is reported of it. known: from rows that they had no part in. weights (n + c,): of the parameters,
+        then the effects'. samples: those of the session's last segment that hold the effects, with internal states.
         """
-        self.state.added += event.parameters
+        masses = self.base.physical_values(weights[: self.base.n])
+        reference = dict(zip((p.name for p in self.model.parameters), masses.tolist(), strict=True))
+        larger = changed_model(self.model, declaring(self._system, effects))
+        held = {p.name for p in larger.parameters}
+        fresh = [name for name in event.parameters if name in held]  # others are constants
+        if not self.state.reference and any(effect.needs_masses for effect in larger.effects):
+            self.state.reference = reference
+        self.state.added += fresh
         self._follow_adopted((*self.state.adopted, *effects))
-        known = known.widened(len(event.parameters))
+        known = known.widened(len(fresh))
         self.state.events.append(event)
+        self.state.segment, self.state.index, self.state.values = samples.segment, samples.index, samples.values
         self.state.clear, self.state.wanted = int(samples.index[0]), DECISION
         self.detector = self._new_detector()
         self.detector.begin(known)
@@ -346,9 +355,10 @@ class Changes(Stage):
 
     def _follow_adopted(self, adopted: tuple[Effect, ...]) -> None:
         fresh = adopted[len(self.state.adopted) :]
-        self._system = self._system.model_copy(update={"effects": (*self._system.effects, *fresh)})
+        self._system = declaring(self._system, fresh)
         self.state.adopted = adopted
-        self._extend()
+        if adopted:
+            self._extend()
 
     def prior(self, described: Prior) -> Prior:
         """What is known beforehand of the current parameters: nothing of those that have jumped."""
@@ -360,10 +370,9 @@ class Changes(Stage):
         return replace(whole, std=np.where(gone, np.nan, whole.std))
 
     def _extend(self) -> None:
-        """Model and base with the parameters that events have added."""
-        if self.state.added:
-            self.model = changed_model(self.model, restricted(self._system, self.state.added))
-            self.base = extended(self._described, self.model, self.state.added)
+        """Model and base with the effects, and the parameters, that events have added."""
+        self.model = changed_model(self.model, restricted(self._system, self.state.added), self.state.reference)
+        self.base = extended(self._described, self.model, self.state.added)
 
     @property
     def added(self) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ smoother that knows the dynamics; it gives the estimate as soon as its first spa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING
@@ -16,22 +17,20 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from sms_online.description.schema import System
+from sms_online.description.schema import Effect, System
 from sms_online.effects.build import build_model, refuse_unknown_masses
 from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.blocks import ENERGY_BLOCK, blocks
-from sms_online.pipeline.changes import Adoption
-from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.energy_estimate import EnergyEstimate
 from sms_online.pipeline.events import Event
-from sms_online.pipeline.internal_states import FollowedStates
 from sms_online.pipeline.marker_identity import MarkerIdentity, Swap
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.outliers import LeftOut, Outliers
+from sms_online.pipeline.preparation import Preparation
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.relinearisation import Relinearisation
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, stated_period
@@ -41,6 +40,7 @@ from sms_online.pipeline.tracker_bank import session_trackers
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
+from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior
 
 if TYPE_CHECKING:
@@ -107,11 +107,10 @@ class Estimator(Stage):
         self._outliers = Outliers(len(self.channels), sensors)
         self._attitude = AttitudeContinuity()
         self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
-        self._conditioning = Conditioning(system, self.sensing.channels)
+        self._preparation = Preparation(model, self.sensing)
         # Positions choose the filter's width, as far as their noise is a sensor's; torques pass the same filter for the
         # sake of the lag.
         self._rates = RatesStage(system.sample_rate, *self.sensing.deciding)
-        self._followed = FollowedStates(model, self.sensing, system.sample_rate)
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
         self.trackers = session_trackers(self.sensing, not by_energy)
@@ -310,10 +309,8 @@ class Estimator(Stage):
         self._synchronise(self.state.pending_t, self.state.pending, last=True)
         self.state.pending_t, self.state.pending = self.state.pending_t[:0], self.state.pending[:0]
         for piece in self._synchroniser.flush():
-            self._condition(piece)
-        self._balance_waiting()
-        for rates in self._rates.flush():
-            self._balance(rates)
+            self._prepare(piece)
+        self._end_motion()
         if self._relinearisation is not None:
             self._relinearisation.finish(self.periods)
         if self.smoother is not None:
@@ -329,7 +326,7 @@ class Estimator(Stage):
         if self._relinearisation is not None:
             self._relinearisation.observe(block.t, block.values)
         for piece in self._synchroniser.push(block):
-            self._condition(piece)
+            self._prepare(piece)
         if self.smoother is not None:
             self.smoother.work(self._balanced)
         if t.size:
@@ -337,26 +334,39 @@ class Estimator(Stage):
         for observer in self.observers:
             observer.block_through()
 
-    def adopt(self, adoption: Adoption) -> None:
-        """Go on with effects that the model lacked, see `Changes.adopt`; from within `Observer.block_through` alone."""
-        assert self._relinearisation is not None
-        self._relinearisation.adopt(adoption)
+    def adopt(
+        self, effects: Sequence[Effect], event: Event, known: Information, weights: Array, samples: GridSamples
+    ) -> None:
+        """Go on with effects that the model lacked; from within `Observer.block_through` alone.
 
-    def _condition(self, piece: GridSamples) -> None:
+        samples: of the channels as they came, in the session's newest segment, that hold the effects. See
+        `Changes.adopt` for the others.
+        """
+        assert self._relinearisation is not None
+        if self._preparation.differs(effects):
+            # The motion so far is that of other samples.
+            self._end_motion()
+        prepared = self._preparation.begin(effects, samples)
+        changes = self._relinearisation.momentum.changes
+        self._relinearisation.adopt(changes.adopt(effects, event, known, weights, prepared))
+
+    def _prepare(self, piece: GridSamples) -> None:
         for observer in self.observers:
             observer.samples(piece)
-        for corrected in self._conditioning.push(piece):
-            self._differentiate(corrected)
-
-    def _differentiate(self, piece: GridSamples) -> None:
-        for followed in self._followed.push(piece):
-            motion = self.sensing.motion(followed.values[:, : len(self.sensing.channels)])
-            self.state.unbalanced.append(GridSamples(followed.index, motion, followed.segment))
+        for ready in self._preparation.push(piece):
+            motion = self.sensing.motion(ready.values[:, : len(self.sensing.channels)])
+            self.state.unbalanced.append(GridSamples(ready.index, motion, ready.segment))
             waiting = sum(each.index.size for each in self.state.unbalanced)
             # Beside momentum rows nobody waits for those of the energy.
             if self.momentum is None or waiting >= ENERGY_BLOCK:
                 self._balance_waiting()
-            self._fit(followed)
+            if self._relinearisation is not None:
+                self._relinearisation.push(ready, self._synchroniser.start_time, self.periods)
+
+    def _end_motion(self) -> None:
+        self._balance_waiting()
+        for rates in self._rates.flush():
+            self._balance(rates)
 
     def _balance_waiting(self) -> None:
         waiting, self.state.unbalanced = self.state.unbalanced, []
@@ -366,11 +376,6 @@ class Estimator(Stage):
             for rates in self._rates.push(GridSamples(index, values, segment)):
                 self._balance(rates)
 
-    def _fit(self, piece: GridSamples) -> None:
-        """Hand samples, with their internal states, on to the momentum balance."""
-        if self._relinearisation is not None:
-            self._relinearisation.push(piece, self._synchroniser.start_time, self.periods)
-
     def _balance(self, rates: RateSamples) -> None:
         n_x = self.model.layout.n_x
         x, inputs = rates.values[:, :n_x], rates.values[:, n_x:]
@@ -379,7 +384,7 @@ class Estimator(Stage):
             self.smoother.move(rates.index, x, v)
         for observer in self.observers:
             observer.motion(rates.index, rates.segment, x, v, inputs)
-        signals = np.concatenate((inputs, self._followed.beside(rates)), axis=1)
+        signals = np.concatenate((inputs, self._preparation.states(rates)), axis=1)
         self.energy.push(
             rates.index, rates.segment, x, v, signals, self._rates.sigma[n_x:], self._synchroniser.start_time
         )

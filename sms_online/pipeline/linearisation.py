@@ -100,9 +100,11 @@ class Linearisation(Stage):
         """Stay at this point from now on."""
         self.state.samples, self.state.remembers = [], False
 
-    def corrected(self, samples: GridSamples) -> list[GridSamples]:
-        """Samples of one segment, by themselves."""
-        return self._new_correction().push(samples)
+    def begin(self, samples: GridSamples) -> list[GridSamples]:
+        """Go on from samples of one segment, which come once more; give those that can be corrected by now."""
+        self.forget()
+        self._correction = self._new_correction()
+        return self._correction.push(samples)
 
     def again(self) -> Iterator[tuple[GridSamples, SensorNoise]]:
         """All samples so far, corrected anew, with the noise that was known then."""

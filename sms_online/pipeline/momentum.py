@@ -292,6 +292,7 @@ class Momentum(Stage):
         self.bank.begin(adoption.known)
         self.fit.go_on(adoption.weights, noise, adoption.misfit)
         if adoption.samples.index.size:
+            self.state.segment = adoption.samples.segment
             self._process(adoption.samples, noise)
 
     def finish(self, noise: SensorNoise) -> None:

@@ -108,7 +108,10 @@ class Relinearisation(Stage):
         now.start_time = start_time
         now.waiting.append(piece)
         if (now.noise is None or piece.index[-1] >= now.noise_at + self._renewed) and self._estimate.ready:
-            now.noise, now.noise_at = self._estimate.noise(periods), int(piece.index[-1])
+            now.noise, now.noise_at = (
+                self._estimate.noise(periods, self.momentum.changes.model.system),
+                int(piece.index[-1]),
+            )
             now.made_with = now.made_with or now.noise
             if now.noise.outdates(now.made_with) and self.linearisation.state.samples:
                 # The first samples do not show how slow their noise is, or that it moves.
@@ -125,16 +128,19 @@ class Relinearisation(Stage):
         """End of the session: fit what is still held back."""
         now = self.state
         if now.noise is None and now.waiting and self._estimate.ready:
-            now.noise = self._estimate.noise(periods)
+            now.noise = self._noise(periods)
         if now.noise is not None:
             self.momentum.end_segment(now.noise)
             self._look(now.noise, last=True)
             self.momentum.finish(now.noise)
 
+    def _noise(self, periods: Array) -> SensorNoise:
+        return self._estimate.noise(periods, self.momentum.changes.model.system)
+
     def adopt(self, adoption: Adoption) -> None:
         """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already."""
         assert self.state.noise is not None
-        for samples in self.linearisation.corrected(adoption.samples):
+        for samples in self.linearisation.begin(adoption.samples):
             adoption = replace(adoption, samples=samples)
         self.momentum.adopt(adoption, self.state.noise)
 

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.schema import System
 from sms_online.pipeline.clocks import other_clocks, reference_clock
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.noise import correlation, density_gain, noise_std
@@ -138,8 +139,11 @@ class NoiseEstimate(Stage):
             out.setdefault(self.state.samples[k][0].tobytes(), []).append(k)
         return list(out.values())
 
-    def noise(self, periods: Array) -> SensorNoise:
-        """Noise from what is stated and, where nothing is, from the samples so far; periods (channels,): s, or NaN."""
+    def noise(self, periods: Array, system: System) -> SensorNoise:
+        """Noise from what is stated and, where nothing is, from the samples so far.
+
+        periods (channels,): s, or NaN. system: whose corrections samples have.
+        """
         self._sort()
         sigma = self._sensing.stated_noise
         silent = np.flatnonzero(np.isnan(sigma))
@@ -162,7 +166,7 @@ class NoiseEstimate(Stage):
         sensors = density[positions]
         inputs = self._sensing.inputs(np.sqrt(density)[None])[0] ** 2
         columns = [*positions, *self._sensing.torque_columns]
-        gains = noise_gains(self._sensing.model.system, self._sensing.channels)
+        gains = noise_gains(system, self._sensing.channels)
         grid = (gains * np.sqrt(density * self._sample_rate))[columns]
         coordinates = self._sensing.coordinate_noise(grid[: len(positions)])
         late = by_sensor(found, len(positions), self._sample_rate) if found else None
