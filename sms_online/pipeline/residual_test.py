@@ -26,6 +26,7 @@ from sms_online.calibration.release import at_most_tolerances, release_gain
 from sms_online.model.layout import Layout
 from sms_online.pipeline.latency import WANDER
 from sms_online.pipeline.momentum_windows import HOPS
+from sms_online.pipeline.persistence import Persistence
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.row_types import row_types
 from sms_online.state import Stage, State
@@ -77,7 +78,7 @@ class TestState(State):
 
 
 class SequentialTest(Stage):
-    """Tests the windows of a session, in order, until the first alarm.
+    """Tests the windows of a session, in order, until the first alarm; persistence: of what joints' rows leave.
 
     hop: time from one window to the next, s. limit: h. nuisances: those whose columns come before the parameters'.
     Their tolerances count as `BOUND` times as wide: what they explain beyond their tolerances is reported as such.
@@ -94,6 +95,7 @@ class SequentialTest(Stage):
         self._types = {name: speeds for name, speeds in row_types(layout).items() if len(speeds) > 1}
         tests = layout.n_v + len(self._types)
         self.limit = float(np.log(tests * 3600.0 / hop / FALSE_ALARMS))
+        self.persistence = Persistence()
         nothing = np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
         self.state = TestState(np.zeros((HOPS, tests)), np.full((HOPS, tests), -1, dtype=np.int64), *nothing)
 
@@ -112,6 +114,7 @@ class SequentialTest(Stage):
             self._know(factor if self.state.waiting is None else self.state.waiting)
             self.state.waiting = factor
         self.state.windows += 1
+        self.persistence.push(rows.raw[list(self._layout.theta_m)])
         if self.state.alarm is not None:
             return
         ratios = self._log_likelihood(rows, variance)

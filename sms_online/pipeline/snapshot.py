@@ -8,6 +8,7 @@ from __future__ import annotations
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.statistics import MomentumStatistics, Statistics
+from sms_online.row_types import joint_rows
 from sms_online.state import snapshot, state_copy
 
 
@@ -50,6 +51,7 @@ def _of_momentum(momentum: Momentum, t: float) -> MomentumStatistics:
         started=momentum.started,
         tested=momentum.testable,
         alarm=None if alarm is None else alarm.row,
+        passing=_passing(momentum),
         scale_free=momentum.joint.scale_free(momentum.fit),
         latency=momentum.latencies.found,
         coloured={} if noise is None else noise.coloured,
@@ -59,3 +61,15 @@ def _of_momentum(momentum: Momentum, t: float) -> MomentumStatistics:
         unwatched=momentum.bank.unwatched,
         point=momentum.point(),
     )
+
+
+def _passing(momentum: Momentum) -> dict[str, tuple[str, float]]:
+    """See `MomentumStatistics`; where rows alarm and no parameter moves."""
+    noise, sensing = momentum.sensor_noise, momentum.sensing
+    if noise is None or momentum.test.alarm is None or momentum.reference is not None:
+        return {}
+    passing = momentum.test.persistence.passing(momentum.joint.solved(momentum.fit).pi)
+    driven = [i for i, joint in enumerate(sensing.model.system.joints) if not joint.passive]
+    stds = noise.grid[len(sensing.position_columns) :].tolist()
+    torques = zip(driven, sensing.torque_columns, stds, strict=True)
+    return {joint_rows(i): (sensing.channels[column], std) for i, column, std in torques if passing[i]}

@@ -66,6 +66,7 @@ class Evidence:
     discrepancies: of the running diagnosis.
     jitters: 1σ, s, by which stamps of devices are off at random.
     coloured: correlation time of the noise, s, by channel.
+    noisy: by type of rows that leave more than noise, the torque's channel and the 1σ that they leave, see `noisier`.
     miscalibrated: what is off by more than the description's tolerances allow.
     troubles: of the devices, the recording and the machine of a live session, a short sentence each.
     weaknesses: of an estimate by the way it is made, a short sentence each.
@@ -94,6 +95,7 @@ class Evidence:
     discrepancies: tuple[Discrepancy, ...] = ()
     jitters: Mapping[str, float] = field(default_factory=dict)
     coloured: Mapping[str, float] = field(default_factory=dict)
+    noisy: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
     weaknesses: tuple[str, ...] = ()

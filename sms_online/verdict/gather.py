@@ -15,6 +15,7 @@ from sms_online.pipeline.synchronise import SIDE
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
 from sms_online.verdict.reasons import unexplained_torques
+from sms_online.verdict.torque_noise import noisy_torques
 
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
@@ -43,6 +44,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         discrepancies=tuple(discrepancies),
         jitters={} if momentum is None else momentum.jitters,
         coloured={} if momentum is None else momentum.coloured,
+        noisy={} if momentum is None else noisy_torques(evaluation.residuals, momentum.passing),
         miscalibrated=(*miscalibrated(evaluation), *ambiguous_effects(evaluation)),
         troubles=tuple(troubles),
         weaknesses=tuple(_weaknesses(now)),

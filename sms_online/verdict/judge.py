@@ -10,8 +10,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+from sms_online.row_types import Residuals
 from sms_online.verdict import reasons
 from sms_online.verdict.evidence import Evidence
+from sms_online.verdict.torque_noise import noisier
 from sms_online.verdict.trust import Reason, Trust
 
 
@@ -43,13 +45,13 @@ def judge(evidence: Evidence) -> Trust:
 
 def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
     """Reasons why the numbers are wrong by more than any error bar says, the strongest first."""
-    converged = not evidence.unconverged
+    converged, residual = not evidence.unconverged, _lasting(evidence)
     out = [*reasons.scaled(evidence.comparison), *reasons.lacking(evidence.discrepancies)]
     if converged:
-        rows = [*reasons.unexplained_torques(evidence.residual), *reasons.beyond_limit(evidence.residual)]
+        rows = [*reasons.unexplained_torques(residual), *reasons.beyond_limit(residual)]
         out += reasons.or_drifting(rows) if evidence.still else rows
         out += [each for each in evidence.miscalibrated if each.grave]
-    out += reasons.unnamed(evidence.discrepancies)
+    out += reasons.unnamed(each for each in evidence.discrepancies if each.row not in evidence.noisy)
     out += [each for each in alarmed if each.grave]
     if converged:
         out += [*reasons.negative(evidence.negative), *reasons.disputed(evidence.disputed)]
@@ -58,9 +60,15 @@ def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
 
 def _alarmed(evidence: Evidence) -> list[Reason]:
     """The sequential test's alarm, where no discrepancy of the running diagnosis says the same."""
-    if evidence.alarm is None or any(each.unexplained for each in evidence.discrepancies):
+    said = evidence.alarm in evidence.noisy or any(each.unexplained for each in evidence.discrepancies)
+    if evidence.alarm is None or said:
         return []
     return [reasons.more_than_noise(evidence.alarm, evidence.coloured)]
+
+
+def _lasting(evidence: Evidence) -> Residuals:
+    """Residuals but for those that are noise of torques."""
+    return {row: each for row, each in evidence.residual.items() if row not in evidence.noisy}
 
 
 def _cautions(evidence: Evidence) -> list[Reason]:
@@ -68,7 +76,8 @@ def _cautions(evidence: Evidence) -> list[Reason]:
     out = reasons.weak_torques(evidence.residual)
     out += [each for each in evidence.miscalibrated if not each.grave]
     out += [*reasons.troubled(evidence.troubles), *(Reason(text, False) for text in evidence.weaknesses)]
-    out += [*reasons.beyond_noise(evidence.residual), *reasons.apart(evidence.comparison)]
+    out += noisier(evidence.noisy, evidence.residual)
+    out += [*reasons.beyond_noise(_lasting(evidence)), *reasons.apart(evidence.comparison)]
     out += [*reasons.undetermined(evidence.undetermined), *reasons.attenuated(evidence.attenuated)]
     out += reasons.undecided_changes(evidence.undecided)
     out += reasons.passed(evidence.discrepancies)
