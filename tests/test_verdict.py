@@ -13,14 +13,17 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis import exact_links
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.hypothesis import verdict
-from sms_online.diagnosis.improvement import predicts_worse
+from sms_online.diagnosis.improvement import predicts_worse, supported
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.standstill import SessionStandstill
 from sms_online.diagnosis.weak_windows import SeenMotion
+from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.pipeline.smoothing import smooth
+from tests.axis_effects import SYSTEM, axis_block, nothing
+from tests.sessions_of import session_of
 
 
 def _found(name: str, where: str) -> Candidate:
@@ -156,3 +159,22 @@ def test_the_integral_of_a_sign_is_as_uncertain_as_stated(noise: float) -> None:
         predicted.append(np.sqrt(reversals.squares(lambda v: np.tanh(v / 1e-4), motion).sum()) / 1000.0)
     share = np.sqrt(np.mean(np.square(off))) / np.sqrt(np.mean(np.square(predicted)))
     assert 0.4 < share < 1.5
+
+
+@pytest.mark.parametrize(("worse", "kept"), [(1.05, [0]), (1.3, [0, 1])])
+def test_what_nothing_supports_is_no_finding(worse: float, kept: list[int]) -> None:
+    """Friction that the axis has, and a constant torque that it has not: held-out torques may need it all the same."""
+    block = axis_block(nothing, seconds=4.0)
+    described = declaring(SYSTEM, [Effect(name="torque_offset", where="joint_1")])
+    session = session_of(described, [block])
+    named = {p.name: p for p in session.base.parameters if "@" in p.name}
+    candidates = [SimpleNamespace(parameters=(each,)) for each in named.values()]
+    tracing = SimpleNamespace(candidates=candidates, least_improvement=lambda k: 0.1)
+
+    def state(chosen: list[int]) -> Any:
+        left = 0.02 if 1 in chosen else 0.02 * worse
+        return SimpleNamespace(holdout=SimpleNamespace(relative={"joint_1": left}))
+
+    attempt: Any = SimpleNamespace(tracing=tracing, state=state)
+    assert list(named) == ["viscous_friction@joint_1.damping", "torque_offset@joint_1.torque"]
+    assert supported(attempt, [0, 1], session) == kept

@@ -15,7 +15,13 @@ from sms_online.diagnosis.captures import begins, in_seconds, one_after_another,
 from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, leaves_unexplained, may_explain
 from sms_online.diagnosis.exact_links import with_exact_links
 from sms_online.diagnosis.hypothesis import share_left, verdict
-from sms_online.diagnosis.improvement import explaining_alone, no_joint_worse, predicts_worse, with_constants
+from sms_online.diagnosis.improvement import (
+    explaining_alone,
+    no_joint_worse,
+    predicts_worse,
+    supported,
+    with_constants,
+)
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord
@@ -29,6 +35,7 @@ from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
 from sms_online.verdict.judged import evaluated
 from sms_online.verdict.reasons import LARGEST_RESIDUAL
+from sms_online.verdict.torque_noise import noisy_torques
 
 
 @one_blas_thread()
@@ -50,13 +57,14 @@ def diagnose(
     selected. further: captures of the same rig that are searched with the first, each predicted from the others.
     Raises InputError where a channel is missing or there is too little motion for any row.
     """
-    what = "fitting the model as described"
     runs = [blocks, *further]
     clock = wrong_clock(system, np.concatenate([block.t for block in blocks]))
     if clock is not None:
         runs, holdout = [in_seconds(run, clock.before) for run in runs], in_seconds(holdout, clock.before)
     runs = one_after_another(runs)
-    before, record = _session(system, runs, source, prior, lambda share: progress(what, FITTED_ONCE * share))
+    before, record = _session(
+        system, runs, source, prior, lambda share: progress("fitting the model as described", FITTED_ONCE * share)
+    )
     _check_measured(before, source)
     progress("looking for mistakes of units, signs and wiring", FITTED_ONCE)
     corrected = find_mistakes(before, record.segments())
@@ -123,16 +131,21 @@ def diagnose(
         attempt, chosen = earlier.pop()
         constants, after = [], attempt.state(chosen)
     late = late if attempt.system != system else []
+    partial, estimator_after = stop(), before
+    # Where parameters come from the rows of the diagnosis, no other session has any to give.
+    what = "fitting the model with what was found"
+    while after.system != system and not partial and not attempt.by_rows:
+        estimator_after, _ = _session(
+            after.system, runs, source, prior, lambda share: progress(what, SEARCHED + (1.0 - SEARCHED) * share)
+        )
+        kept = supported(attempt, chosen, estimator_after)
+        if kept == chosen:
+            break
+        chosen, estimator_after = kept, before
+        after = attempt.state(chosen)
+    named = after.system != system
     attempt.tracing.weigh(chosen)
     findings = [*constants, *(attempt.tracing.finding(chosen, k) for k in chosen)]
-    named, partial = after.system != system, stop()
-    estimator_after = before
-    # Where parameters come from the rows of the diagnosis, no other session has any to give.
-    if named and not partial and not attempt.by_rows:
-        what, rest = "fitting the model with what was found", 1.0 - SEARCHED
-        estimator_after, _ = _session(
-            after.system, runs, source, prior, lambda share: progress(what, SEARCHED + rest * share)
-        )
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
@@ -140,6 +153,8 @@ def diagnose(
     # for a change. What a change does not explain may only look like one.
     if not partial and said != "named" and not leaves_unexplained(before):
         _check_unchanged(before, source)
+    if said == "unexplained" and {name for name, row in after.test.items() if row.beyond} <= _noisy(estimator_after):
+        said = "named" if named else "clean"
     grave = said == "clean" and evaluated(before).trust.grave
     # What is left unexplained takes such numbers anywhere.
     calibration = () if said == "unexplained" else _miscalibrated(estimator_after)
@@ -223,6 +238,13 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
         unexplained=None,
         drifts=drifts,
     )
+
+
+def _noisy(session: Estimator) -> set[str]:
+    """Types of rows whose torques a session shows to be noisier than their samples do."""
+    now = evaluated(session)
+    momentum = now.statistics.momentum
+    return set() if momentum is None else set(noisy_torques(now.residuals, momentum.passing))
 
 
 def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:

@@ -15,7 +15,9 @@ from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.folds import LEAST_RISE
 from sms_online.diagnosis.hypothesis import Correction, corrections
 from sms_online.diagnosis.trace import DECISIVE
+from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
+from sms_online.verdict.judged import evaluated
 
 # What is found may leave so many times of the held-out torque that the description leaves: of rows without a torque it
 # may explain all, and torques of noise differ by less.
@@ -122,6 +124,28 @@ def no_joint_worse(attempt: Attempt, chosen: list[int]) -> list[int]:
         if all(after[row] <= (1.0 + LEAST_RISE) * before[row] for row in before.keys() & after.keys()):
             return step
     return []
+
+
+def supported(attempt: Attempt, chosen: list[int], session: Estimator) -> list[int]:
+    """Those chosen, but for those that neither a session of the whole capture nor its held-out torques support.
+
+    The session determines none of their coefficients: it allows for more than the search does, for changes and for
+    noise in columns. And without them no joint's torque is predicted clearly worse.
+    """
+    parameters, determined = session.base.parameters, evaluated(session).determined
+    known = {p.name for p, is_known in zip(parameters, determined, strict=True) if is_known}
+    weak = {p.name for p in parameters} - known
+    kept, candidates = list(chosen), attempt.tracing.candidates
+    for k in chosen:
+        own = {p.name for p in candidates[k].parameters}
+        if not own or not own <= weak:
+            continue
+        without = [other for other in kept if other != k]
+        with_it, less = (attempt.state(each).holdout.relative for each in (kept, without))
+        least = attempt.tracing.least_improvement(k)
+        if with_it and all(with_it[row] > (1.0 - least) * less[row] for row in with_it):
+            kept = without
+    return kept
 
 
 def predicts_worse(before: Mapping[str, float], after: Mapping[str, float]) -> bool:
