@@ -22,9 +22,11 @@ from sms_online.diagnosis.record import LONGEST, Segment, bounded, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
+from sms_online.diagnosis.scale_free import NEAR
 from sms_online.effects.build import build_model, with_effects
 from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import noise_gains
+from sms_online.pipeline.description import LOOSE, described
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.second_order import SecondOrderNoise
@@ -136,22 +138,50 @@ def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | No
     Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
     explain them it shrinks π, with π their noise, and with that their weight grows without end.
     """
+    value, size = described(rows.model, rows.base)
     columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
     if LEAST_ROWS * columns.shape[2] > rows.b.size:
         columns = rows.Y
     std = np.ones_like(rows.b)
     for _ in range(STARTS):
-        rows.reweight(together(columns / std[..., None], rows.b / std, prior)[: rows.base.n])
+        alone, beta = _beside_candidates(columns / std[..., None], rows.b / std, prior, value, size)
+        rows.reweight(beta)
         std = rows.std
-    _reweight(rows, rows.beta)
+    # Parameters that the prior keeps would hide that the rows have drawn the others to zero.
+    _reweight(rows, beta if _likely(rows, alone) else value)
+
+
+def _beside_candidates(columns: Array, b: Array, prior: Prior | None, value: Array, size: Array) -> tuple[Array, Array]:
+    """Parameters (n,) of a joint fit of columns (W, n_v, n + c) to b (W, n_v), by the rows alone and as weights.
+
+    A candidate may act as a parameter does: friction by direction as viscous friction. Their coefficients then cancel
+    each other at any size, but noise is propagated by the parameters alone. So weights have the loose prior of those of
+    a session (`pipeline.description`): value (n,), of deviation size, beside rows that are uncertain by what the fit
+    leaves. What has no size, as an effect that is described without coefficients, stays near its value where the rows
+    hardly determine it.
+    """
+    n = value.size
+    R = np.asarray(np.linalg.qr(np.column_stack((columns.reshape(b.size, -1), b.ravel())), mode="r"))
+    left = abs(float(R[-1, -1])) / np.sqrt(b.size)
+    loose = np.divide(left, LOOSE * size, out=np.zeros(n), where=size > 0.0)
+    lengths = np.hypot(loose, NEAR * np.linalg.norm(R[:, :n], axis=0))
+    known = np.zeros((n, R.shape[1]))
+    known[:, :n], known[:, -1] = np.diag(lengths), lengths * value
+    alone, beta = (together(each[:, None, :-1], each[:, -1:], prior)[:n] for each in (R, np.concatenate((R, known))))
+    return alone, beta
 
 
 def _reweight(rows: SessionRows, beta: Array) -> None:
     """Whiten the rows with parameters beta (n,), or with the described ones where these cannot be."""
-    described = rows.base.values(rows.model.nominal)
-    sizes, expected = (_sizes(rows, each)[~np.any(rows.b, axis=0)] for each in (beta, described))
-    likely = np.all((expected == 0.0) | ((sizes >= SHRUNK * expected) & (SHRUNK * sizes <= expected)))
-    rows.reweight(beta if likely else described)
+    rows.reweight(beta if _likely(rows, beta) else rows.base.values(rows.model.nominal))
+
+
+def _likely(rows: SessionRows, beta: Array) -> bool:
+    """Whether rows without a torque have not drawn parameters beta (n,) to another scale."""
+    sizes, expected = (
+        _sizes(rows, each)[~np.any(rows.b, axis=0)] for each in (beta, rows.base.values(rows.model.nominal))
+    )
+    return bool(np.all((expected == 0.0) | ((sizes >= SHRUNK * expected) & (SHRUNK * sizes <= expected))))
 
 
 def _sizes(rows: SessionRows, beta: Array) -> Array:
