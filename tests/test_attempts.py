@@ -11,6 +11,7 @@ from sms_online.diagnosis.attempt import Attempt, Case
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
+from tests.axis_effects import SYSTEM, axis_block
 from tests.slow_encoder import F, K, bench, session
 
 EFFECTS = [Effect(name=name, where="joint_1") for name in ("coulomb_friction", "cubic_stiffness", "torque_offset")]
@@ -102,3 +103,15 @@ def test_a_described_lag_leaves_the_spring_beside_a_torque_that_wanders() -> Non
     assert found.verdict == "unexplained"
     spring = found.after.parameters["joint_1.stiffness"]
     assert abs(spring.value - K) < 3.0 * spring.std < 0.03 * K
+
+
+def test_what_an_event_added_to_a_session_is_no_part_of_the_description() -> None:
+    """Coulomb friction begins after 6 s, and an event adds it to the session's model; a lag is then tried."""
+    block = axis_block(lambda q, rate: np.sign(rate), begin=6.0)
+    found = attempt_of(SYSTEM, block, [])
+    names = ["link_1.inertia", "viscous_friction@joint_1.damping"]
+    assert [p.name for p in found.case.session.base.parameters] == [*names, "coulomb_friction@joint_1.torque"]
+    lag = Effect(name="sensor_lag", where="q_1", coefficients={"corner": CORNER})
+    tried = found.trial(SYSTEM, [lag], found.rows.beta, [])
+    for each in (found, tried):
+        assert [p.name for p in each.rows.base.parameters] == names

@@ -208,7 +208,8 @@ class Attempt(Hypothesis):
         self.case, self.system = case, system
         session = case.session
         described = with_effects(system, constants)
-        same = described == session.system
+        # An event may have added an effect to the session's model.
+        same = described == session.model.system
         estimator = session if same else Estimator(described, session.sensing.channels, case.source)
         self._known = case.prior(estimator)
         prior = self._known if case.use_prior else None
