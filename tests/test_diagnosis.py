@@ -108,8 +108,15 @@ def test_the_missing_effect_is_named_with_its_place_and_size(text: str, accuracy
 
 
 @pytest.mark.long
-def test_two_effects_are_found_in_turn() -> None:
-    texts = "viscous_friction@joint_1:damping=2", "cubic_stiffness@joint_2:stiffness=300"
+@pytest.mark.parametrize(
+    "texts",
+    [
+        ("viscous_friction@joint_1:damping=2", "cubic_stiffness@joint_2:stiffness=300"),
+        # Either leaves more of the link's own rows, and hardly anything of all others.
+        ("tip_payload@tip:mass=0.74", "link_mass_damping@link_2:rate=1.98"),
+    ],
+)
+def test_two_effects_are_found_in_turn(texts: tuple[str, ...]) -> None:
     diagnosis = diagnosed(*texts)
     assert diagnosis.verdict == "named"
     assert set(keys(diagnosis)) == {text.partition(":")[0] for text in texts}

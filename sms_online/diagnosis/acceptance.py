@@ -19,6 +19,8 @@ LEAST_FOLDS = 4
 # Share by which an effect has to lower the rms of held-out rows where whole captures are predicted from others: on
 # measured rigs laws that gained as much across two runs helped on a third.
 ACROSS_CAPTURES = 0.02
+# Share by which the rms of all held-out rows falls where an effect is taken whatever its own rows do.
+MUCH = 0.5
 # Rows of another type may rise by this share of the squares by which an effect lowers those that it acts on.
 SMALL_RISE = 0.05
 # A coefficient is significant beyond this multiple of its deviation.
@@ -34,10 +36,18 @@ class Acceptance(HeldOutRows):
         return ACROSS_CAPTURES if self.folds.across and not traits.learned else traits.least_improvement
 
     def improves(self, chosen: Sequence[int], candidate: int) -> bool:
-        """Whether a candidate beside those chosen lowers the residual of held-out rows, and no other type's rises."""
+        """Whether a candidate beside those chosen lowers the residual of held-out rows, and no other type's rises.
+
+        Or that of all rows together by much: what else is lacking may have drawn the fit to the rows that it acts on.
+        """
         together, least = [*chosen, candidate], self.least_improvement(candidate)
         acts = self._acts(candidate)
         before, after = (self.fitted(each, chosen) for each in (chosen, together))
+        if not self.floor.any() and fall(before.sum(axis=1), after.sum(axis=1)).share >= MUCH:
+            held = (self.held_out(each, chosen).sum(axis=1) for each in (chosen, together))
+            whole = fall(*held)
+            if whole.share >= MUCH and whole.certain:
+                return True
         if fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1)).share < least:
             return False  # not even of the rows that it is fitted to
         before, after = (self.held_out(each, chosen) for each in (chosen, together))
