@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import Effect, System
-from sms_online.effects.catalogue import ENTRIES
+from sms_online.effects.catalogue import ENTRIES, places
 from sms_online.stream import Array
 
 # One number in eighty is further off than its tolerance says by chance.
@@ -27,9 +27,9 @@ HELD = 1e-6
 
 
 def sayable(system: System) -> frozenset[str]:
-    """Tolerances that effects of the catalogue say: where a parameter is known, not what is relative to a place."""
+    """Tolerances that effects of the catalogue say in a system: where a parameter is known, not what is relative."""
     entries = (each for each in ENTRIES.values() if system.scale_tolerance is not None or not each.relative_to)
-    return frozenset(name for entry in entries for name in entry.traits.calibrates)
+    return frozenset(name for entry in entries for name in entry.traits.calibrates if places(system, entry.at))
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ class TableTilt(Constant, Force):
     entry = Entry(
         "table_tilt", "force", "base", {"gravity_x": "m/s²", "gravity_y": "m/s²"},
         "a base that turns by a quarter turn or more: gravity does not turn with it, a leak does",
-        traits=Traits(signed=True, course="smooth"),
+        traits=Traits(signed=True, course="smooth", calibrates=("gravity",)),
     )  # fmt: skip
     needs_masses = True
 
