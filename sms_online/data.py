@@ -12,8 +12,8 @@ from sms_online.errors import InputError
 from sms_online.recorded import Recorded
 from sms_online.stream import Block
 
-# A capture, the path of one, of a log or of a recording, or blocks in order of time.
-Data = Capture | Recorded | str | Path | Iterable[Block]
+# A capture, the path of one, of a log or of a recording, a block, or blocks in order of time.
+Data = Capture | Recorded | str | Path | Block | Iterable[Block]
 
 
 def recorded_session(system: System, data: Data, folder: Path | None = None) -> Recorded:
@@ -23,6 +23,8 @@ def recorded_session(system: System, data: Data, folder: Path | None = None) -> 
     """
     if isinstance(data, Recorded):
         return data
+    if isinstance(data, Block):
+        data = [data]
     if isinstance(data, Capture):
         return Recorded(data, data.source, data.truth)
     if isinstance(data, str | Path):

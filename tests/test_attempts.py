@@ -115,3 +115,15 @@ def test_what_an_event_added_to_a_session_is_no_part_of_the_description() -> Non
     tried = found.trial(SYSTEM, [lag], found.rows.beta, [])
     for each in (found, tried):
         assert [p.name for p in each.rows.base.parameters] == names
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coulomb", [0.0, pytest.param(0.01, marks=pytest.mark.long)])
+def test_a_lag_is_found_where_the_spring_vanishes_without_it(coulomb: float) -> None:
+    """All candidates together explain a link encoder behind 20 Hz; none of them does, but by a spring of nothing."""
+    found = sms.diagnose(bench(), session(20.0, coulomb))
+    lag = next(effect for effect in found.effects if effect.name == "sensor_lag")
+    assert lag.where == "q_1"
+    assert lag.coefficients["corner"].value == pytest.approx(20.0, rel=0.02)
+    assert {effect.name for effect in found.effects} <= {"sensor_lag", "presliding_friction", "coulomb_friction"}
+    assert found.after.parameters["joint_1.stiffness"].value == pytest.approx(K, rel=0.01)

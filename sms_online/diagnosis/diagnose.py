@@ -27,6 +27,7 @@ from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.unexplained import describe_residual
+from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
@@ -100,10 +101,15 @@ def diagnose(
     while (_explains_little(before) or attempt.tracing.freed) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
-        lagging = attempt.system.model_copy(update={"effects": (*attempt.system.effects, found.effect)})
-        attempt = Attempt(case, lagging)
+        attempt = Attempt(case, declaring(attempt.system, [found.effect]))
     progress("searching for effects", TRACED)
     chosen = attempt.search()
+    if not (late or chosen or stop()) and _beyond(attempt, chosen) and (found := find_late(attempt.rows)):
+        # All candidates together may explain what none of them does, by parameters that vanish.
+        lagging = Attempt(case, declaring(system, [found.effect]))
+        others = lagging.search()
+        if not _beyond(lagging, others):
+            late, attempt, chosen = [found], lagging, others
     if late and (forces := explaining_alone(case, system, attempt, chosen)):
         late, attempt = [], Attempt(case, system)
         chosen = attempt.search(forces)
@@ -116,8 +122,7 @@ def diagnose(
     ranking = attempt.tracing.ranking()
     attempt.tracing.weigh(chosen)
     attempt, chosen, constants = with_constants(case, attempt, chosen, bare, progress)
-    beyond = not stop() and any(row.beyond for row in attempt.test(chosen).values())
-    if beyond and kinematic_candidates(attempt.system):
+    if not stop() and _beyond(attempt, chosen) and kinematic_candidates(attempt.system):
         progress("comparing exact links", SEARCHED)
         exact = with_exact_links(case, attempt, chosen)
         if exact is not None:
@@ -261,6 +266,11 @@ def _check_measured(session: Estimator, source: str) -> None:
         )
     if session.momentum.sensor_noise is None:
         raise InputError(source, "", "too few samples to estimate the sensors' noise", "a longer capture")
+
+
+def _beyond(attempt: Attempt, chosen: Sequence[int]) -> bool:
+    """Whether rows leave more than noise with the effects chosen."""
+    return any(row.beyond for row in attempt.test(chosen).values())
 
 
 def _explains_little(estimator: Estimator) -> bool:
