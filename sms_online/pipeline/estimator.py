@@ -343,12 +343,14 @@ class Estimator(Stage):
         `Changes.adopt` for the others.
         """
         assert self._relinearisation is not None
-        if self._preparation.differs(effects):
+        differs = self._preparation.differs(effects)
+        if differs:
             # The motion so far is that of other samples.
             self._end_motion()
         prepared = self._preparation.begin(effects, samples)
         changes = self._relinearisation.momentum.changes
-        self._relinearisation.adopt(changes.adopt(effects, event, known, weights, prepared))
+        adoption = changes.adopt(effects, event, known, weights, prepared)
+        self._relinearisation.adopt(adoption, self.periods if differs else None)
 
     def _prepare(self, piece: GridSamples) -> None:
         for observer in self.observers:

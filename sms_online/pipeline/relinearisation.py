@@ -137,8 +137,13 @@ class Relinearisation(Stage):
     def _noise(self, periods: Array) -> SensorNoise:
         return self._estimate.noise(periods, self.momentum.changes.model.system)
 
-    def adopt(self, adoption: Adoption) -> None:
-        """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already."""
+    def adopt(self, adoption: Adoption, periods: Array | None) -> None:
+        """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already.
+
+        periods (channels,): sample periods, s, where samples are prepared in another way than before, with other noise.
+        """
+        if periods is not None:
+            self.state.noise = self._noise(periods)
         assert self.state.noise is not None
         for samples in self.linearisation.begin(adoption.samples):
             adoption = replace(adoption, samples=samples)

@@ -340,7 +340,8 @@ def moving(suspected: Suspected | None) -> list[Reason]:
     if suspected is None:
         return []
     names = listed(suspected.parameters)
-    text = f"{names} seems to move since {suspected.since:.1f} s, and is not followed"
+    moves, are = ("seem", "are") if len(suspected.parameters) > 1 else ("seems", "is")
+    text = f"{names} {moves} to move since {suspected.since:.1f} s, and {are} not followed"
     where = place_of(suspected.parameters[0])
     return [Reason(text, False, where, "may move", then=GO_ON if suspected.learning else FOLLOW)]
 
