@@ -172,5 +172,5 @@ def test_a_sloping_table_may_slope_otherwise() -> None:
     sloping = parts(0.003, -0.002, 0.0)
     assert list(sloping) == ["z", "x", "y"]
     tilted = planar.model_copy(update={"gravity": (0.003, -0.002, 0.0)})
-    np.testing.assert_allclose(sloping["x"].moved(tilted, 1e-3).gravity, [0.003, -0.002 + 9.78e-3, 0.0], atol=1e-7)
-    np.testing.assert_allclose(sloping["y"].moved(tilted, 1e-3).gravity, [0.003 - 9.78e-3, -0.002, 0.0], atol=1e-7)
+    np.testing.assert_allclose(sloping["x"].moved(tilted, 1e-3).gravity, [0.003, -0.002 + 9.76e-3, 0.0], atol=1e-7)
+    np.testing.assert_allclose(sloping["y"].moved(tilted, 1e-3).gravity, [0.003 - 9.76e-3, -0.002, 0.0], atol=1e-7)

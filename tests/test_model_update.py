@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import sms_online as sms
 from sms_online.description.schema import Effect, System
@@ -30,9 +31,9 @@ FRICTION, WIDTH = 0.2, 0.05  # N m, rad
 SUBSTEPS = 20
 
 
-def distorted(effect: Effect, begin: float = BEGIN) -> Block:
+def distorted(effect: Effect, begin: float = BEGIN, seconds: float = 16.0) -> Block:
     """The axis, whose encoder an effect distorts from an instant on, s."""
-    block = axis_block(nothing)
+    block = axis_block(nothing, seconds=seconds)
     (distorting,) = channel_effects(declaring(SYSTEM, [effect]))
     angle = np.sin(2 * block.t) + 0.3 * np.sin(5 * block.t)
     values = block.values.copy()
@@ -123,6 +124,75 @@ def test_it_is_the_same_sample_by_sample_and_resumed(make: Callable[[], Block]) 
     continued.push(second)
     continued.finish()
     assert results_document(continued, 0.0, []) == results_document(estimator, 0.0, [])
+
+
+def part(block: Block, kept: NDArray[np.bool_]) -> Block:
+    return Block(block.t[kept], block.channels, block.values[kept])
+
+
+@pytest.mark.slow
+def test_two_updates_with_a_gap_behind_them_are_resumed() -> None:
+    """A lag from 6 s on, cogging from 14 s on, no samples from 20 to 20.6 s; saved between, and after both."""
+    lagged, cogged = distorted(LAG, begin=6.0, seconds=26.0), axis_block(cogging, 14.0, seconds=26.0)
+    values = np.stack((cogged.values[:, 0], lagged.values[:, 1]), axis=1)
+    block = part(Block(cogged.t, cogged.channels, values), (cogged.t < 20.0) | (cogged.t > 20.6))
+    estimator, online = watched(block)
+    assert [episode.named[0].key for episode in online.episodes] == ["sensor_lag@q_1", "cogging@joint_1"]
+    assert_true(estimator, AXIS | {"cogging@joint_1.cosine": COGGING * np.cos(0.5)})
+    for time in (11.0, 17.0):
+        running = Estimator(SYSTEM, block.channels, "test")
+        OnlineDiagnosis(running, Immediate(), adopt=True)
+        running.push(part(block, block.t < time))
+        continued = resumed(Estimator(SYSTEM, block.channels, "test"), running)
+        OnlineDiagnosis(continued, Immediate(), adopt=True)
+        for each in (running, continued):
+            each.push(part(block, block.t >= time))
+            each.finish()
+        assert results_document(running, 0.0, []) == results_document(estimator, 0.0, [])
+        assert [event.kind for event in continued.events] == ["effect", "effect"]
+        assert_true(continued, AXIS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("behind", [0.02, 0.14, 0.3])
+def test_an_update_just_behind_a_gap_loses_nothing(behind: float) -> None:
+    """The segment at the update, which comes at 10.2 s, is shorter than what takes the lag off."""
+    block = distorted(LAG)
+    estimator, online = watched(part(block, (block.t < 9.7 - behind) | (block.t > 10.2 - behind)))
+    (episode,) = online.episodes
+    assert episode.adopted is not None
+    assert_true(estimator, AXIS)
+
+
+@pytest.mark.slow
+def test_samples_behind_an_update_are_corrected_by_the_point() -> None:
+    """An encoder half a millisecond late, which moves the point that rows are linear about; then cogging, from 12 s."""
+    clean, t = axis_block(cogging, 12.0, seconds=20.0), np.arange(round(20.0 * RATE)) / RATE
+
+    def angle(t: Array) -> Array:
+        return np.asarray(np.sin(2 * t) + 0.3 * np.sin(5 * t))
+
+    late = clean.values[:, 1] + angle(t - 5e-4) - angle(t)
+    estimator, _ = watched(Block(t, clean.channels, np.stack((clean.values[:, 0], late), axis=1)), size=8)
+    assert estimator.momentum is not None
+    assert estimator.momentum.point()[0] == pytest.approx(5e-4, rel=0.1)
+    assert [event.kind for event in estimator.events] == ["effect"]
+    assert (np.diff(estimator.momentum.changes.state.index) == 1).all()
+    assert_true(estimator, AXIS)
+
+
+@pytest.mark.slow
+def test_a_parameter_that_an_event_has_added_is_resumed() -> None:
+    block = axis_block(lambda q, rate: 0.3 * np.sign(rate), BEGIN)
+    running = Estimator(SYSTEM, block.channels, "test")
+    running.push(part(block, block.t < 13.0))
+    assert running.momentum is not None
+    assert running.momentum.changes.added == ("coulomb_friction@joint_1.torque",)
+    continued = resumed(Estimator(SYSTEM, block.channels, "test"), running)
+    for each in (running, continued):
+        each.push(part(block, block.t >= 13.0))
+        each.finish()
+    assert results_document(continued, 0.0, []) == results_document(running, 0.0, [])
 
 
 @pytest.mark.slow

@@ -42,11 +42,21 @@ def test_noise_that_samples_do_not_show_is_said(seed: int) -> None:
     assert residual.whitened > 3.0
     assert (result.trust.level, result.trust.grave) == ("doubt", False)
     assert "force_1" in result.trust.reasons[0]
-    assert "state noise under [[sensor]]" in result.trust.next_step
+    assert "sms-online diagnose" in result.trust.next_step
+    assert "state noise: force_1" in result.trust.next_step
     true = {"link_1.inertia": INERTIA, "viscous_friction@joint_1.damping": DAMPING}
     for name, value in true.items():
         found = result.parameters[name]
         assert found.value == pytest.approx(value, abs=4.0 * found.std), name
+
+
+@pytest.mark.long
+def test_a_diagnosis_does_not_call_it_clean() -> None:
+    """For such noise hides a small force that lasts."""
+    found = sms.diagnose(parse_system(AXIS, "axis.toml"), coloured(1))
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert (found.trust.level, found.trust.grave) == ("doubt", False)
+    assert "no known effect explains what is left" in found.trust.reasons[0]
 
 
 def test_once_it_is_stated_rows_leave_noise() -> None:
@@ -76,7 +86,8 @@ def test_only_what_does_not_last_passes(kind: str, passes: bool) -> None:
     weight /= np.linalg.norm(weight)
     white = np.convolve(rng.standard_normal(windows + HOPS - 2), weight, mode="valid")
     t = np.arange(windows)
-    force = {"slow": np.sin(t / 20.0), "sine": np.sin(2.0 * np.pi * t / HOPS)}.get(kind, 0.0 * t)
+    slow, sine = np.sin(t / 20.0), np.sin(2.0 * np.pi * t / HOPS)
+    force = {"slow": slow, "small": 0.6 * slow, "sine": sine}.get(kind, 0.0 * t)
     persistence = Persistence()
     for left in white + force:
         persistence.push(np.array([[0.0, -left]]))

@@ -169,7 +169,11 @@ def test_what_nothing_supports_is_no_finding(worse: float, kept: list[int]) -> N
     session = session_of(described, [block])
     named = {p.name: p for p in session.base.parameters if "@" in p.name}
     candidates = [SimpleNamespace(parameters=(each,)) for each in named.values()]
-    tracing = SimpleNamespace(candidates=candidates, least_improvement=lambda k: 0.1)
+    tracing = SimpleNamespace(
+        candidates=candidates,
+        least_improvement=lambda k: 0.1,
+        improvement=lambda chosen, k: SimpleNamespace(share=0.05),
+    )
 
     def state(chosen: list[int]) -> Any:
         left = 0.02 if 1 in chosen else 0.02 * worse

@@ -21,8 +21,8 @@ from sms_online.stream import Array
 
 # Step of the differences that give derivatives, m or rad: 1e-6 of them is lost to curvature, less to rounding.
 STEP = 1e-6
-# Gravity at the equator, m/s², the least on the ground: what a plane does not hold of it lies across the plane.
-LEAST_GRAVITY = 9.78
+# Gravity, m/s², less than anywhere on the ground: what a plane does not hold of it lies across the plane.
+LEAST_GRAVITY = 9.76
 
 
 def same_readings(described: Model, moved: Model, x: Array, v: Array) -> tuple[Array, Array]:

@@ -36,7 +36,6 @@ from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
 from sms_online.verdict.judged import evaluated
 from sms_online.verdict.reasons import LARGEST_RESIDUAL
-from sms_online.verdict.torque_noise import noisy_torques
 
 
 @one_blas_thread()
@@ -158,8 +157,6 @@ def diagnose(
     # for a change. What a change does not explain may only look like one.
     if not partial and said != "named" and not leaves_unexplained(before):
         _check_unchanged(before, source)
-    if said == "unexplained" and {name for name, row in after.test.items() if row.beyond} <= _noisy(estimator_after):
-        said = "named" if named else "clean"
     grave = said == "clean" and evaluated(before).trust.grave
     # What is left unexplained takes such numbers anywhere.
     calibration = () if said == "unexplained" else _miscalibrated(estimator_after)
@@ -243,13 +240,6 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
         unexplained=None,
         drifts=drifts,
     )
-
-
-def _noisy(session: Estimator) -> set[str]:
-    """Types of rows whose torques a session shows to be noisier than their samples do."""
-    now = evaluated(session)
-    momentum = now.statistics.momentum
-    return set() if momentum is None else set(noisy_torques(now.residuals, momentum.passing))
 
 
 def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:

@@ -135,14 +135,14 @@ def supported(attempt: Attempt, chosen: list[int], session: Estimator) -> list[i
     parameters, determined = session.base.parameters, evaluated(session).determined
     known = {p.name for p, is_known in zip(parameters, determined, strict=True) if is_known}
     weak = {p.name for p in parameters} - known
-    kept, candidates = list(chosen), attempt.tracing.candidates
-    for k in chosen:
-        own = {p.name for p in candidates[k].parameters}
-        if not own or not own <= weak:
-            continue
+    kept, tracing = list(chosen), attempt.tracing
+    own = {k: {p.name for p in tracing.candidates[k].parameters} for k in chosen}
+    doubtful = [k for k in chosen if own[k] and own[k] <= weak]
+    # Of effects that explain the same the weaker one goes.
+    for k in sorted(doubtful, key=lambda k: tracing.improvement([other for other in chosen if other != k], k).share):
         without = [other for other in kept if other != k]
         with_it, less = (attempt.state(each).holdout.relative for each in (kept, without))
-        least = attempt.tracing.least_improvement(k)
+        least = tracing.least_improvement(k)
         if with_it and all(with_it[row] > (1.0 - least) * less[row] for row in with_it):
             kept = without
     return kept

@@ -388,5 +388,5 @@ def _sizes(named: Named) -> dict[str, tuple[float, float, str]]:
 def refusal(model: Model) -> str | None:
     """Why a model cannot be updated while a session runs, None where it can."""
     if model.n_states:
-        return "its effects have internal states, which are followed from a session's start alone"
+        return "an effect of the model has internal states already, and a change would have them begin anew"
     return None

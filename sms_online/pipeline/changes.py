@@ -329,26 +329,33 @@ class Changes(Stage):
         return GridSamples(self.state.index[after], self.state.values[after], self.state.segment)
 
     def adopt(
-        self, effects: Sequence[Effect], event: Event, known: Information, weights: Array, samples: GridSamples
+        self,
+        effects: Sequence[Effect],
+        event: Event,
+        known: Information,
+        weights: Array,
+        samples: GridSamples,
+        since: int,
     ) -> Adoption:
         """Go on with effects that the model lacked.
 
         event: what is reported of it. known: from rows that they had no part in. weights (n + c,): of the parameters,
-        then the effects'. samples: those of the session's last segment that hold the effects, with internal states.
+        then the effects'. samples: those of the session's last segment that hold the effects, as `keep` takes them;
+        none where a gap was just before. since: grid index from which on samples hold them.
         """
         masses = self.base.physical_values(weights[: self.base.n])
         reference = dict(zip((p.name for p in self.model.parameters), masses.tolist(), strict=True))
-        larger = changed_model(self.model, declaring(self._system, effects))
+        larger, keys = changed_model(self.model, declaring(self._system, effects)), {effect.key for effect in effects}
         held = {p.name for p in larger.parameters}
         fresh = [name for name in event.parameters if name in held]  # others are constants
-        if not self.state.reference and any(effect.needs_masses for effect in larger.effects):
+        if not self.state.reference and any(each.needs_masses for each in larger.effects if each.key in keys):
             self.state.reference = reference
         self.state.added += fresh
         self._follow_adopted((*self.state.adopted, *effects))
         known = known.widened(len(fresh))
         self.state.events.append(event)
         self.state.segment, self.state.index, self.state.values = samples.segment, samples.index, samples.values
-        self.state.clear, self.state.wanted = int(samples.index[0]), DECISION
+        self.state.clear, self.state.wanted = since, DECISION
         self.detector = self._new_detector()
         self.detector.begin(known)
         return Adoption(self.model, self.base, known, weights, np.zeros(self.model.layout.n_v), samples)
@@ -357,7 +364,7 @@ class Changes(Stage):
         fresh = adopted[len(self.state.adopted) :]
         self._system = declaring(self._system, fresh)
         self.state.adopted = adopted
-        if adopted:
+        if adopted or self.state.added:
             self._extend()
 
     def prior(self, described: Prior) -> Prior:

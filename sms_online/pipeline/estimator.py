@@ -343,14 +343,12 @@ class Estimator(Stage):
         `Changes.adopt` for the others.
         """
         assert self._relinearisation is not None
-        differs = self._preparation.differs(effects)
+        differs, since = self._preparation.differs(effects), int(samples.index[0])
         if differs:
             # The motion so far is that of other samples.
             self._end_motion()
-        prepared = self._preparation.begin(effects, samples)
-        changes = self._relinearisation.momentum.changes
-        adoption = changes.adopt(effects, event, known, weights, prepared)
-        self._relinearisation.adopt(adoption, self.periods if differs else None)
+        prepared, periods = self._preparation.begin(effects, samples, differs), self.periods if differs else None
+        self._relinearisation.adopt(effects, event, known, weights, prepared, since, periods)
 
     def _prepare(self, piece: GridSamples) -> None:
         for observer in self.observers:

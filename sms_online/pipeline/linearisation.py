@@ -100,11 +100,12 @@ class Linearisation(Stage):
         """Stay at this point from now on."""
         self.state.samples, self.state.remembers = [], False
 
-    def begin(self, samples: GridSamples) -> list[GridSamples]:
+    def begin(self, samples: GridSamples) -> GridSamples:
         """Go on from samples of one segment, which come once more; give those that can be corrected by now."""
         self.forget()
         self._correction = self._new_correction()
-        return self._correction.push(samples)
+        ready = self._correction.push(samples) if samples.index.size else []
+        return ready[0] if ready else GridSamples(samples.index[:0], samples.values[:0], samples.segment)
 
     def again(self) -> Iterator[tuple[GridSamples, SensorNoise]]:
         """All samples so far, corrected anew, with the noise that was known then."""

@@ -34,7 +34,7 @@ class PreparationState(State):
 class Preparation(Stage):
     """Corrections of one session's channels, and internal states of effects.
 
-    model: of the system as described. Segments are numbered anew from where it has begun anew.
+    model: of the system as described. Numbers of segments go up by one at each update that changes the preparation.
     """
 
     def __init__(self, model: Model, sensing: Sensing) -> None:
@@ -72,12 +72,12 @@ class Preparation(Stage):
         now, after = self._model, self._with(effects)
         return after.n_states > now.n_states or len(corrections(after.system)) > len(corrections(now.system))
 
-    def begin(self, effects: Sequence[Effect], samples: GridSamples) -> GridSamples:
+    def begin(self, effects: Sequence[Effect], samples: GridSamples, differs: bool) -> GridSamples:
         """Go on with further effects, from samples of the newest segment that hold them; give these as prepared.
 
-        Internal states begin at rest with the first of them.
+        differs: whether they are prepared in another way. Internal states begin at rest with the first of them.
         """
-        self.state.begun += self.differs(effects)
+        self.state.begun += differs
         self.state.effects = (*self.state.effects, *effects)
         self._build()
         nothing = np.empty((0, samples.values.shape[1] + self._model.n_states))

@@ -8,15 +8,14 @@ does where rows turn out to lack more than a drift that was yet to be learned: t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 
 import msgspec
 
 from sms_online.calibration.columns import nuisances
-from sms_online.description.schema import TrackerChoice
+from sms_online.description.schema import Effect, TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.changes import Adoption
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.linearisation import Linearisation
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_fit import FIRST_MOTION
@@ -26,6 +25,7 @@ from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
 from sms_online.stream import Array
+from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Prior
 
 # Frequency that a window lets pass best, times its length.
@@ -108,10 +108,7 @@ class Relinearisation(Stage):
         now.start_time = start_time
         now.waiting.append(piece)
         if (now.noise is None or piece.index[-1] >= now.noise_at + self._renewed) and self._estimate.ready:
-            now.noise, now.noise_at = (
-                self._estimate.noise(periods, self.momentum.changes.model.system),
-                int(piece.index[-1]),
-            )
+            now.noise, now.noise_at = self._noise(periods), int(piece.index[-1])
             now.made_with = now.made_with or now.noise
             if now.noise.outdates(now.made_with) and self.linearisation.state.samples:
                 # The first samples do not show how slow their noise is, or that it moves.
@@ -137,16 +134,26 @@ class Relinearisation(Stage):
     def _noise(self, periods: Array) -> SensorNoise:
         return self._estimate.noise(periods, self.momentum.changes.model.system)
 
-    def adopt(self, adoption: Adoption, periods: Array | None) -> None:
+    def adopt(
+        self,
+        effects: Sequence[Effect],
+        event: Event,
+        known: Information,
+        weights: Array,
+        samples: GridSamples,
+        since: int,
+        periods: Array | None,
+    ) -> None:
         """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already.
 
-        periods (channels,): sample periods, s, where samples are prepared in another way than before, with other noise.
+        samples: as prepared, not yet corrected by the point. periods (channels,): sample periods, s, where samples are
+        prepared in another way than before, with other noise.
         """
+        corrected = self.linearisation.begin(samples)
+        adoption = self.momentum.changes.adopt(effects, event, known, weights, corrected, since)
         if periods is not None:
             self.state.noise = self._noise(periods)
         assert self.state.noise is not None
-        for samples in self.linearisation.begin(adoption.samples):
-            adoption = replace(adoption, samples=samples)
         self.momentum.adopt(adoption, self.state.noise)
 
     def _advance(self, corrected: Iterable[tuple[GridSamples, SensorNoise]]) -> None:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from sms_online.row_types import Residuals
 from sms_online.verdict import reasons
 from sms_online.verdict.evidence import Evidence
-from sms_online.verdict.torque_noise import noisier
+from sms_online.verdict.torque_noise import NOISY, noisier
 from sms_online.verdict.trust import Reason, Trust
 
 
@@ -51,7 +51,7 @@ def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
         rows = [*reasons.unexplained_torques(residual), *reasons.beyond_limit(residual)]
         out += reasons.or_drifting(rows) if evidence.still else rows
         out += [each for each in evidence.miscalibrated if each.grave]
-    out += reasons.unnamed(each for each in evidence.discrepancies if each.row not in evidence.noisy)
+    out += [each for each in reasons.unnamed(evidence.discrepancies) if not evidence.noisy.keys() & set(each.places)]
     out += [each for each in alarmed if each.grave]
     if converged:
         out += [*reasons.negative(evidence.negative), *reasons.disputed(evidence.disputed)]
@@ -67,7 +67,7 @@ def _alarmed(evidence: Evidence) -> list[Reason]:
 
 
 def _lasting(evidence: Evidence) -> Residuals:
-    """Residuals but for those that are noise of torques."""
+    """Residuals without those of noisy torques."""
     return {row: each for row, each in evidence.residual.items() if row not in evidence.noisy}
 
 
@@ -77,6 +77,8 @@ def _cautions(evidence: Evidence) -> list[Reason]:
     out += [each for each in evidence.miscalibrated if not each.grave]
     out += [*reasons.troubled(evidence.troubles), *(Reason(text, False) for text in evidence.weaknesses)]
     out += noisier(evidence.noisy, evidence.residual)
+    unnamed = reasons.unnamed(evidence.discrepancies)
+    out += [replace(each, grave=False) for each in unnamed if evidence.noisy.keys() & set(each.places)]
     out += [*reasons.beyond_noise(_lasting(evidence)), *reasons.apart(evidence.comparison)]
     out += [*reasons.undetermined(evidence.undetermined), *reasons.attenuated(evidence.attenuated)]
     out += reasons.undecided_changes(evidence.undecided)
@@ -101,6 +103,10 @@ def judge_diagnosis(
     """
     if verdict == "clean":
         return after
+    noisy = [reason for reason in after.grounds if reason.mark == NOISY]
+    if verdict == "unexplained" and noisy and not (effects or after.grave):
+        text = "no known effect explains what is left, which does not last: noise of torques, or a fast force"
+        return Trust("doubt", (Reason(text, False, noisy[0].places, "unexplained", then=noisy[0].then), *after.grounds))
     found = _unexplained(effects, row, near) if verdict == "unexplained" else _named(effects, after, either)
     # The session with what was named says so too.
     rest = [reason for reason in after.grounds if not (either and reason.mark == reasons.UNDECIDED)]

@@ -1,7 +1,8 @@
 """Torques that are noisier than their samples show: what their rows leave does not last from window to window.
 
-Differences of a torque's samples show the noise of high frequencies; what is slower nobody distinguishes from the
-torque, but by what the model leaves of it. Error bars hold beside it, for it is independent from window to window.
+Differences of a torque's samples show its noise at high frequencies. Slower noise is seen in what the model leaves
+alone. So is a force that the model lacks, and a small one that lasts is hidden by such noise: up to a third of the rms
+that is left. So rows of such torques are a reason to doubt.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from sms_online.row_types import Residuals
-from sms_online.verdict.reasons import NOISE_RESIDUAL, NOISE_WHITENED, listed
+from sms_online.verdict.reasons import DIAGNOSE, NOISE_RESIDUAL, NOISE_WHITENED, listed
 from sms_online.verdict.trust import Reason
 
 # Digits of a noise to be stated.
 DIGITS = 2
+# Mark of the reason on the arm.
+NOISY = "noisy torque"
 
 
 def noisy_torques(residual: Residuals, passing: Mapping[str, tuple[str, float]]) -> dict[str, tuple[str, float]]:
@@ -41,5 +44,5 @@ def noisier(noisy: Mapping[str, tuple[str, float]], residual: Residuals) -> list
     text = f"{listed(channels)}: up to {most:.2g} × the noise that samples show"
     full = f"{text}; what they leave does not last from window to window, as a force would that the model lacks"
     stated = ", ".join(f"{channel} {std:.{DIGITS}g}" for channel, std in noisy.values())
-    then = f"state noise under [[sensor]] for these torques, as they leave it: {stated}"
-    return [Reason(text, False, tuple(noisy), "noisy torque", full, then)]
+    then = f"{DIAGNOSE}; if it finds nothing, and these torques are known to be so noisy, state noise: {stated}"
+    return [Reason(text, False, tuple(noisy), NOISY, full, then)]
