@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import sms_online as sms
 from sms_online.evaluation import Evaluation
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Block
+from tests.axis_effects import SYSTEM, axis_block
 from tests.slow_encoder import bench, session
 
 
@@ -29,3 +31,15 @@ def test_a_zero_that_a_session_finds_leaves_no_torque() -> None:
     described = estimator.energy.joint_residuals[0].relative(found.estimate.pi)
     assert described is not None
     assert described > 0.3
+
+
+def test_a_share_behind_an_event_is_of_samples_behind_it() -> None:
+    """Friction from 8 s on: samples of before are still on their way to this balance when the event is decided on."""
+    session = sms.Session(SYSTEM, ("force_1", "q_1"))
+    session.update(axis_block(lambda q, rate: 0.3 * np.sign(rate), 8.0))
+    session.finish()
+    assert [event.kind for event in session.result.events] == ["friction"]
+    # 0.01 N m of noise of some 1.9 N m.
+    relative = session.result.residuals["joint_1"].relative
+    assert relative is not None
+    assert relative < 0.01

@@ -48,9 +48,12 @@ class EnergyEstimate(Stage):
         """What errors that rows share do to the estimate."""
         return self._energy.shared
 
-    def begin_joints(self, model: Model, base: BaseParameters, sensing: Sensing | None) -> None:
-        """Residuals of the joints count from now on, in these parameters; sensing: where nuisances are estimated."""
-        self._joints = JointBalance(model, base, self._sample_rate, sensing)
+    def begin_joints(self, model: Model, base: BaseParameters, sensing: Sensing | None, since: int = 0) -> None:
+        """Residuals of the joints count from a grid index on, in these parameters.
+
+        sensing: where nuisances are estimated. Samples of before may still be on their way here.
+        """
+        self._joints, self._since = JointBalance(model, base, self._sample_rate, sensing), since
 
     @property
     def joint_residuals(self) -> list[SquaredResidual]:
@@ -83,4 +86,5 @@ class EnergyEstimate(Stage):
             t = start_time + rows.index[finite] / self._sample_rate
             self.tracker.update(Rows(rows.Y[finite], rows.b[finite], np.ones(t.size), t))
             now.newest_row = float(t[-1])
-        self._joints.push(index, x, v, signals)
+        after = index >= self._since
+        self._joints.push(index[after], x[after], v[after], signals[after])

@@ -190,8 +190,10 @@ class Estimator(Stage):
 
     def _begin_joints(self) -> None:
         """Residuals of the joints count since the last event, in the parameters that hold since then."""
-        sensing = None if self._relinearisation is None else self.sensing
-        self.energy.begin_joints(self.model, self.base, sensing)
+        sensing, since = None if self._relinearisation is None else self.sensing, 0
+        if self.events:
+            since = int(np.ceil((self.events[-1].time - self.start_time) * self.system.sample_rate))
+        self.energy.begin_joints(self.model, self.base, sensing, since)
 
     @property
     def samples(self) -> int:
