@@ -25,7 +25,7 @@ WORDS = {
 NAMES = {
     "tracked_point": "tracked point",
     "axis": "axis",
-    "gravity": "direction of gravity",
+    "gravity": "tilt of gravity",
     "marker_station": "place along the link",
     "gauge_low_pass": "low-pass",
     "encoder_zero": "zero",

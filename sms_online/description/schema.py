@@ -157,7 +157,7 @@ class Tolerances(Record):
     tracked_point: of S, along each axis of the base, m.
     length: of a link, and of a joint's place along each axis, m.
     axis: direction of a joint's axis and mount, rad.
-    gravity: direction of gravity, rad.
+    gravity: tilt of gravity against what is described, rad; where a plane slopes, its slope too.
     marker_station: place of a marker along its link, m.
     clock: a device's clock against that of the torques, s; where all channels come from one, of encoders, base,
     gauges and markers.

@@ -23,7 +23,7 @@ from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.scale_free import NEAR
-from sms_online.effects.build import build_model, with_effects
+from sms_online.effects.build import build_model, declaring, with_effects, with_kinematics
 from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.description import LOOSE, described
@@ -207,10 +207,10 @@ class Attempt(Hypothesis):
         """
         self.case, self.system = case, system
         session = case.session
-        described = with_effects(system, constants)
+        declared = with_effects(system, constants)
         # An event may have added an effect to the session's model.
-        same = described == session.model.system
-        estimator = session if same else Estimator(described, session.sensing.channels, case.source)
+        same = with_kinematics(declared) == session.model.system
+        estimator = session if same else Estimator(declared, session.sensing.channels, case.source)
         self._known = case.prior(estimator)
         prior = self._known if case.use_prior else None
         noise = _noise_behind(estimator, case)
@@ -220,14 +220,14 @@ class Attempt(Hypothesis):
         least = least_samples(system)
         # Corrections reach beyond a stretch.
         channels = session.sensing.channels
-        whole = ([corrected(described, channels, segment) for segment in each] for each in (case.segments, case.held))
+        whole = ([corrected(declared, channels, segment) for segment in each] for each in (case.segments, case.held))
         fitting, self._held = (
             [part for part in excerpts(each, length, longest) if part.index.size > least] for each in whole
         )
         rows = SessionRows(
             estimator.model, estimator.base, estimator.sensing, noise, fitting, second_order=second_order
         )
-        make = CandidateColumns(rows, described)
+        make = CandidateColumns(rows, declared)
         # Half of the windows, where there are two blocks, give twice as many rows as there are parameters.
         wanted = 2 * (2 * rows.base.n // rows.model.layout.n_v + 1)
         if rows.count < wanted:
@@ -311,9 +311,9 @@ class Attempt(Hypothesis):
 
     def adopted(self, chosen: Sequence[int]) -> System:
         """The described system with everything that was found."""
-        described = with_effects(self.system, self.constants)
+        declared = with_effects(self.system, self.constants)
         effects = [self.tracing.candidates[k].effect for k in chosen]
-        return described.model_copy(update={"effects": (*described.effects, *effects)})
+        return declaring(declared, effects)
 
     @cached_property
     def _joints(self) -> RelativeResiduals:
