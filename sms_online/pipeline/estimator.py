@@ -122,7 +122,7 @@ class Estimator(Stage):
         )
         # Behind what may have it begin anew when states are put back.
         self.energy = EnergyEstimate(model, base, system.sample_rate)
-        self._begin_joints()
+        self.energy.begin_joints(model, base, None if by_energy else self.sensing)
         slowest = None if by_energy else stated_period(system, self.sensing.channels)
         self._first_block, self._block = blocks(system, slowest, whole)
         self.finished = False  # no more samples come
@@ -190,10 +190,8 @@ class Estimator(Stage):
 
     def _begin_joints(self) -> None:
         """Residuals of the joints count since the last event, in the parameters that hold since then."""
-        sensing, since = None if self._relinearisation is None else self.sensing, 0
-        if self.events:
-            since = int(np.ceil((self.events[-1].time - self.start_time) * self.system.sample_rate))
-        self.energy.begin_joints(self.model, self.base, sensing, since)
+        since = (self.events[-1].time - self.start_time) * self.system.sample_rate if self.events else 0.0
+        self.energy.begin_joints(self.model, self.base, self.sensing, int(np.ceil(since)))
 
     @property
     def samples(self) -> int:
