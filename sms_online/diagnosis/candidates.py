@@ -21,7 +21,7 @@ from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows
 from sms_online.effects.base import Ranges, joints_of, position
-from sms_online.effects.build import build_model
+from sms_online.effects.build import build_model, declaring
 from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, traits_of
 from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
@@ -340,7 +340,7 @@ class CandidateColumns:
 
     def _declaring(self, effect: Effect) -> System:
         """The system with one more effect."""
-        return self.system.model_copy(update={"effects": (*self.system.effects, effect)})
+        return declaring(self.system, [effect])
 
     def _torque_rate(self, where: str) -> Array:
         """∫ φ d(n τ)/dt dt of a joint in its motor's row (W, n_v), differentiated by way of φ."""

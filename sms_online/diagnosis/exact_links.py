@@ -6,19 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt, Case
 from sms_online.diagnosis.trace import DECISIVE
+from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.pipeline.momentum_windows import HOPS
 
 # Exact links have to take this share of what straight ones leave beyond noise.
 STIFFENING_TAKES = 0.1
-
-
-def _exact(system: System, links: Sequence[Effect]) -> System:
-    """The system with links exact, by effects that say so."""
-    return system.model_copy(update={"effects": (*system.effects, *links)})
 
 
 def with_exact_links(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Attempt | None:
@@ -36,7 +32,7 @@ def with_exact_links(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Att
 
     def excess(links: Sequence[Effect]) -> float:
         try:
-            some = attempt.trial(_exact(attempt.system, links), attempt.constants, beta, effects)
+            some = attempt.trial(declaring(attempt.system, links), attempt.constants, beta, effects)
         except np.linalg.LinAlgError:
             return np.inf  # the readings are those of links that are straight
         return some.excess(range(len(some.tracing.candidates)))
@@ -54,6 +50,6 @@ def with_exact_links(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Att
     if straight - least <= max(chance, STIFFENING_TAKES * straight):
         return None
     try:
-        return Attempt(case, _exact(attempt.system, links), (), beta)
+        return Attempt(case, declaring(attempt.system, links), (), beta)
     except np.linalg.LinAlgError:
         return None

@@ -22,6 +22,7 @@ from sms_online.diagnosis.record import Segment, joined
 from sms_online.diagnosis.searcher import Named, Outcome, Request, Searcher
 from sms_online.effects.build import with_effects
 from sms_online.model.model import Model
+from sms_online.pipeline.changes import ModelUpdate
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum import Momentum
@@ -369,10 +370,10 @@ class OnlineDiagnosis(Observer):
             dropped_windows=0,
         )
         weights = np.concatenate((outcome.beta, *(named.values for named in outcome.named)))
-        effects = [named.effect for named in outcome.named]
-        estimator.adopt(effects, event, known, weights, samples)
+        effects, since = [named.effect for named in outcome.named], int(samples.index[0])
+        estimator.adopt(ModelUpdate(effects, event, known, weights, since), samples)
         self._events = len(estimator.events)
-        self._valid = int(samples.index[0])
+        self._valid = since
         episode.adopted = self._now
 
 

@@ -33,7 +33,7 @@ from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.searcher import Named, Outcome, Request
 from sms_online.diagnosis.weak_windows import WeakWindows
-from sms_online.effects.build import build_model, with_effects
+from sms_online.effects.build import build_model, declaring, with_effects
 from sms_online.effects.catalogue import ENTRIES, declarable
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array
@@ -290,7 +290,7 @@ def _coefficients(
     system, base = request.model.system, request.base
     units = declarable(ENTRIES[effect.name], system)
     if parameters:
-        declared = system.model_copy(update={"effects": (*system.effects, effect)})
+        declared = declaring(system, [effect])
         model = build_model(declared, base.physical_values(solution[: base.n]))
         known = [*range(base.n), *range(own.start, own.stop)]
         names = [p.name for p in (*base.parameters, *parameters)]

@@ -60,6 +60,21 @@ class Adoption:
     samples: GridSamples
 
 
+@dataclass(frozen=True)
+class ModelUpdate:
+    """Effects that the model lacked, to go on with.
+
+    event: what is reported of them. known: from rows that they had no part in. weights (n + c,): of the parameters,
+    then the effects'. since: grid index from which on samples hold them.
+    """
+
+    effects: Sequence[Effect]
+    event: Event
+    known: Information
+    weights: Array
+    since: int
+
+
 class ChangesState(State):
     """Events so far, and what the next one is decided by.
 
@@ -328,37 +343,28 @@ class Changes(Stage):
         after = self.state.index >= max(index, self.state.clear)
         return GridSamples(self.state.index[after], self.state.values[after], self.state.segment)
 
-    def adopt(
-        self,
-        effects: Sequence[Effect],
-        event: Event,
-        known: Information,
-        weights: Array,
-        samples: GridSamples,
-        since: int,
-    ) -> Adoption:
+    def adopt(self, update: ModelUpdate, samples: GridSamples) -> Adoption:
         """Go on with effects that the model lacked.
 
-        event: what is reported of it. known: from rows that they had no part in. weights (n + c,): of the parameters,
-        then the effects'. samples: those of the session's last segment that hold the effects, as `keep` takes them;
-        none where a gap was just before. since: grid index from which on samples hold them.
+        samples: those of the session's last segment that hold the effects, as `keep` takes them; none where a gap was
+        just before.
         """
-        masses = self.base.physical_values(weights[: self.base.n])
+        masses = self.base.physical_values(update.weights[: self.base.n])
         reference = dict(zip((p.name for p in self.model.parameters), masses.tolist(), strict=True))
-        larger, keys = changed_model(self.model, declaring(self._system, effects)), {effect.key for effect in effects}
-        held = {p.name for p in larger.parameters}
-        fresh = [name for name in event.parameters if name in held]  # others are constants
+        larger = changed_model(self.model, declaring(self._system, update.effects))
+        held, keys = {p.name for p in larger.parameters}, {effect.key for effect in update.effects}
+        fresh = [name for name in update.event.parameters if name in held]  # others are constants
         if not self.state.reference and any(each.needs_masses for each in larger.effects if each.key in keys):
             self.state.reference = reference
         self.state.added += fresh
-        self._follow_adopted((*self.state.adopted, *effects))
-        known = known.widened(len(fresh))
-        self.state.events.append(event)
+        self._follow_adopted((*self.state.adopted, *update.effects))
+        known = update.known.widened(len(fresh))
+        self.state.events.append(update.event)
         self.state.segment, self.state.index, self.state.values = samples.segment, samples.index, samples.values
-        self.state.clear, self.state.wanted = since, DECISION
+        self.state.clear, self.state.wanted = update.since, DECISION
         self.detector = self._new_detector()
         self.detector.begin(known)
-        return Adoption(self.model, self.base, known, weights, np.zeros(self.model.layout.n_v), samples)
+        return Adoption(self.model, self.base, known, update.weights, np.zeros(self.model.layout.n_v), samples)
 
     def _follow_adopted(self, adopted: tuple[Effect, ...]) -> None:
         fresh = adopted[len(self.state.adopted) :]

@@ -9,7 +9,6 @@ smoother that knows the dynamics; it gives the estimate as soon as its first spa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import groupby, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING
@@ -17,13 +16,14 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model, refuse_unknown_masses
 from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.blocks import ENERGY_BLOCK, blocks
+from sms_online.pipeline.changes import ModelUpdate
 from sms_online.pipeline.energy_estimate import EnergyEstimate
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.marker_identity import MarkerIdentity, Swap
@@ -40,7 +40,6 @@ from sms_online.pipeline.tracker_bank import session_trackers
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
-from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Estimate, Prior
 
 if TYPE_CHECKING:
@@ -334,21 +333,18 @@ class Estimator(Stage):
         for observer in self.observers:
             observer.block_through()
 
-    def adopt(
-        self, effects: Sequence[Effect], event: Event, known: Information, weights: Array, samples: GridSamples
-    ) -> None:
+    def adopt(self, update: ModelUpdate, samples: GridSamples) -> None:
         """Go on with effects that the model lacked; from within `Observer.block_through` alone.
 
-        samples: of the channels as they came, in the session's newest segment, that hold the effects. See
-        `Changes.adopt` for the others.
+        samples: of the channels as they came, in the session's newest segment, that hold the effects.
         """
         assert self._relinearisation is not None
-        differs, since = self._preparation.differs(effects), int(samples.index[0])
+        differs = self._preparation.differs(update.effects)
         if differs:
             # The motion so far is that of other samples.
             self._end_motion()
-        prepared, periods = self._preparation.begin(effects, samples, differs), self.periods if differs else None
-        self._relinearisation.adopt(effects, event, known, weights, prepared, since, periods)
+        prepared = self._preparation.begin(update.effects, samples, differs)
+        self._relinearisation.adopt(update, prepared, self.periods if differs else None)
 
     def _prepare(self, piece: GridSamples) -> None:
         for observer in self.observers:

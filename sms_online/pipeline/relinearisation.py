@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterable, Sequence
 import msgspec
 
 from sms_online.calibration.columns import nuisances
-from sms_online.description.schema import Effect, TrackerChoice
+from sms_online.description.schema import TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.pipeline.events import Event
+from sms_online.pipeline.changes import ModelUpdate
 from sms_online.pipeline.linearisation import Linearisation
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_fit import FIRST_MOTION
@@ -25,7 +25,6 @@ from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
 from sms_online.stream import Array
-from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Prior
 
 # Frequency that a window lets pass best, times its length.
@@ -134,23 +133,14 @@ class Relinearisation(Stage):
     def _noise(self, periods: Array) -> SensorNoise:
         return self._estimate.noise(periods, self.momentum.changes.model.system)
 
-    def adopt(
-        self,
-        effects: Sequence[Effect],
-        event: Event,
-        known: Information,
-        weights: Array,
-        samples: GridSamples,
-        since: int,
-        periods: Array | None,
-    ) -> None:
-        """Go on with effects that the model lacked, see `Changes.adopt`; rows are there already.
+    def adopt(self, update: ModelUpdate, samples: GridSamples, periods: Array | None) -> None:
+        """Go on with effects that the model lacked; rows are there already.
 
-        samples: as prepared, not yet corrected by the point. periods (channels,): sample periods, s, where samples are
-        prepared in another way than before, with other noise.
+        samples: that hold them, as prepared, not yet corrected by the point. periods (channels,): sample periods, s,
+        where samples are prepared in another way than before, with other noise.
         """
         corrected = self.linearisation.begin(samples)
-        adoption = self.momentum.changes.adopt(effects, event, known, weights, corrected, since)
+        adoption = self.momentum.changes.adopt(update, corrected)
         if periods is not None:
             self.state.noise = self._noise(periods)
         assert self.state.noise is not None
