@@ -21,7 +21,7 @@ from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.sample_faults import PIECE, StuckGuard, unit_of_stamps
 from sms_online.stream import Array, Block
 from sms_online.tables import Tabled, html_table, text_table
-from sms_online.verdict.reasons import MANY_OUTLIERS
+from sms_online.verdict.sample_reasons import MANY_OUTLIERS
 
 SCHEMA = "sms-online/check/1"
 UNDETERMINED = "not at all"

@@ -12,7 +12,7 @@ import numpy as np
 from sms_online.capture import Capture
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import Effect, System
-from sms_online.effects.build import build_model
+from sms_online.effects.build import build_model, declaring
 from sms_online.effects.catalogue import ENTRIES, check_effect, parse_effect
 from sms_online.errors import InputError
 from sms_online.stream import Block
@@ -58,7 +58,7 @@ class Simulated:
             raise InputError("effects", "", repr(effects), f"a list of effects, [{effects!r}]")
         injected: list[Effect] = []
         for effect in effects:
-            whole = system.model_copy(update={"effects": (*system.effects, *injected)})
+            whole = declaring(system, injected)
             if isinstance(effect, Effect):
                 check_effect(whole, effect, "effects", effect.key)
                 injected.append(effect)
@@ -71,7 +71,7 @@ class Simulated:
                 raise InputError("effects", effect.key, "nothing of it", expected)
         if duration is not None and not 0.0 < duration <= LONGEST:
             raise InputError("simulate", "duration", f"{duration:g} s", f"more than 0, at most {LONGEST:g} s")
-        whole = system.model_copy(update={"effects": (*system.effects, *injected)})
+        whole = declaring(system, injected)
         drifts = parsed(drift)
         model = build_model(whole) if drifts else None
         for each in drifts:
@@ -85,7 +85,7 @@ class Simulated:
     @cached_property
     def system(self) -> System:
         """The system that moves."""
-        return self.described.model_copy(update={"effects": (*self.described.effects, *self.effects)})
+        return declaring(self.described, self.effects)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:

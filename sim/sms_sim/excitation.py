@@ -23,6 +23,7 @@ from scipy.optimize import linprog
 
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import Effect, System, Trajectory
+from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import parse_effect
 from sms_online.errors import InputError
 from sms_online.stream import Array
@@ -161,7 +162,7 @@ def _with_pair(system: System, separate: Sequence[str]) -> System:
         raise InputError("--separate", "", f"{len(separate)} effects", "two")
     effects: list[Effect] = []
     for text in separate:
-        whole = system.model_copy(update={"effects": (*system.effects, *effects)})
+        whole = declaring(system, effects)
         known = {effect.key: effect for effect in system.effects}
         head = text.partition(":")[0]
         if head in known:
@@ -170,7 +171,7 @@ def _with_pair(system: System, separate: Sequence[str]) -> System:
                 raise InputError("--separate", text, "an effect that the system file declares", expected)
             continue
         effects.append(parse_effect(text, whole, "--separate"))
-    return system.model_copy(update={"effects": (*system.effects, *effects)})
+    return declaring(system, effects)
 
 
 def _criterion(bounds: Array, loads: Array) -> Array:

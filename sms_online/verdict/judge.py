@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from sms_online.row_types import Residuals
-from sms_online.verdict import reasons
+from sms_online.verdict import reasons, sample_reasons
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.torque_noise import NOISY, noisier
 from sms_online.verdict.trust import Reason, Trust
@@ -26,15 +26,15 @@ def judge(evidence: Evidence) -> Trust:
     alarmed = _alarmed(evidence)
     wrong = _wrong(evidence, alarmed)
     # Faults of the samples come before what they may have done to the estimate.
-    samples, few = reasons.of_samples(evidence), reasons.outliers(evidence.outliers, few=True)
+    samples, few = sample_reasons.of_samples(evidence), sample_reasons.outliers(evidence.outliers, few=True)
     if wrong:
         return Trust("doubt", (*samples, *wrong, *few, *_cautions(evidence)), grave=True)
     samples += few
     if never := [name for name, since in evidence.silent.items() if math.isinf(since)]:
-        return Trust("not yet", (reasons.never_received(never), *samples, *_cautions(evidence)))
+        return Trust("not yet", (sample_reasons.never_received(never), *samples, *_cautions(evidence)))
     if evidence.unconverged:
         # What keeps samples from coming is to be mended before anybody moves more.
-        first = [*reasons.silenced(evidence.silent), *reasons.troubled(evidence.troubles)]
+        first = [*sample_reasons.silenced(evidence.silent), *sample_reasons.troubled(evidence.troubles)]
         rest = _cautions(replace(evidence, troubles=()))
         return Trust("not yet", (*first, reasons.unconverged(evidence.unconverged), *samples, *rest))
     # An alarm that is not grave is one that coloured noise may have caused.
@@ -51,7 +51,7 @@ def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
         rows = [*reasons.unexplained_torques(residual), *reasons.beyond_limit(residual)]
         out += reasons.or_drifting(rows) if evidence.still else rows
         out += [each for each in evidence.miscalibrated if each.grave]
-    out += [each for each in reasons.unnamed(evidence.discrepancies) if not evidence.noisy.keys() & set(each.places)]
+    out += _unnamed(evidence, noisy=False)
     out += [each for each in alarmed if each.grave]
     if converged:
         out += [*reasons.negative(evidence.negative), *reasons.disputed(evidence.disputed)]
@@ -66,6 +66,12 @@ def _alarmed(evidence: Evidence) -> list[Reason]:
     return [reasons.more_than_noise(evidence.alarm, evidence.coloured)]
 
 
+def _unnamed(evidence: Evidence, noisy: bool) -> list[Reason]:
+    """Residuals beyond their noise for no known reason, of noisy torques or of all other rows."""
+    found = reasons.unnamed(evidence.discrepancies)
+    return [each for each in found if noisy != evidence.noisy.keys().isdisjoint(each.places)]
+
+
 def _lasting(evidence: Evidence) -> Residuals:
     """Residuals without those of noisy torques."""
     return {row: each for row, each in evidence.residual.items() if row not in evidence.noisy}
@@ -75,10 +81,9 @@ def _cautions(evidence: Evidence) -> list[Reason]:
     """What makes some of the numbers, or their error bars, worse than they look."""
     out = reasons.weak_torques(evidence.residual)
     out += [each for each in evidence.miscalibrated if not each.grave]
-    out += [*reasons.troubled(evidence.troubles), *(Reason(text, False) for text in evidence.weaknesses)]
+    out += [*sample_reasons.troubled(evidence.troubles), *(Reason(text, False) for text in evidence.weaknesses)]
     out += noisier(evidence.noisy, evidence.residual)
-    unnamed = reasons.unnamed(evidence.discrepancies)
-    out += [replace(each, grave=False) for each in unnamed if evidence.noisy.keys() & set(each.places)]
+    out += [replace(each, grave=False) for each in _unnamed(evidence, noisy=True)]
     out += [*reasons.beyond_noise(_lasting(evidence)), *reasons.apart(evidence.comparison)]
     out += [*reasons.undetermined(evidence.undetermined), *reasons.attenuated(evidence.attenuated)]
     out += reasons.undecided_changes(evidence.undecided)

@@ -22,14 +22,6 @@ NOISE_WHITENED = 1.5
 NOISE_RESIDUAL = 0.1
 # Up to here a multiple of the noise is not given: it is rounded to one, or samples are exact and there is no noise.
 JUST_NOISE = 1.05
-# Share of the samples that may be lost before the rest is no fair part of the motion.
-LARGEST_LOSS = 0.01
-# Share of a channel's samples that may be outliers before its sensor is at fault.
-MANY_OUTLIERS = 1e-3
-# Jitter, s, from which on it is said: below, devices' own clocks are no better.
-LARGEST_JITTER = 5e-5
-# Correlation time of noise, s, from which on windows share it, while they are whitened as if they did not.
-LONGEST_COLOUR = 1e-2
 # Further from the nearest physically consistent parameters than this, in standard deviations, noise brings no estimate.
 LARGEST_DISTANCE = 3.0
 # A session of so many seconds in which no drift is watched for may hold one that matters.
@@ -49,89 +41,13 @@ CHECK_TORQUE = f"check sign, unit and gear ratio of that torque{THEN_DIAGNOSE}"
 CHECK_ROWS = f"check geometry, clocks and stated noise of the sensors in these rows{THEN_DIAGNOSE}"
 CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
-CHECK_OUTLIERS = "look at that sensor: reflections and swapped markers, a loose cable, bits that flip"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
-CHECK_STAMPS = "stamp samples where they are taken, by the device's clock or its count, not where they arrive"
-BY_SMOOTHER = 'state its rate under [[sensor]], or balance = "smoother"'
-CHECK_LOSSES = "look at the faults that the session counted: a bus that is too busy, a loose cable"
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
 OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
-CHECK_DEVICE = "look at power, cable and address of what is silent, and at its table in the system file"
-CHECK_TROUBLE = "mend the device, the recording or the machine that is reported first"
 MOVE = "move all joints, faster and over a larger range, and long enough"
-
-
-def of_samples(evidence: Evidence) -> list[Reason]:
-    """Faults of the samples: loss, many outliers, low rates, jitter and coloured noise."""
-    out = [*_lost(evidence.lost), *outliers(evidence.outliers, few=False), *_slow(evidence.slow)]
-    return [*out, *_jittering(evidence.jitters), *_coloured(evidence.coloured)]
-
-
-def _lost(share: float) -> list[Reason]:
-    if share <= LARGEST_LOSS:
-        return []
-    return [Reason(f"{100.0 * share:.0f} % of the samples are lost", False, then=CHECK_LOSSES)]
-
-
-def _largest(values: Mapping[str, float]) -> tuple[str, float]:
-    """The channel with the largest value in words, with how many more there are, and that value."""
-    worst = max(values, key=lambda channel: values[channel])
-    return worst + (f" and of {len(values) - 1} more channels" if len(values) > 1 else ""), values[worst]
-
-
-def outliers(shares: Mapping[str, float], few: bool) -> list[Reason]:
-    """Outliers, left out; few: those so few that no estimate is wrong by what the other samples have of them."""
-    many = {channel: share for channel, share in shares.items() if share > MANY_OUTLIERS}
-    if not many or few != (max(many.values()) <= LARGEST_LOSS):
-        return []
-    of, worst = _largest(many)
-    text = f"{100.0 * worst:.1g} % of the samples of {of} are outliers, left out"
-    return [Reason(text, False, tuple(many), "outliers", then=CHECK_OUTLIERS)]
-
-
-def _slow(rates: Mapping[str, float]) -> list[Reason]:
-    if not rates:
-        return []
-    text = f"{listed([*rates])}: {min(rates.values()):.3g} samples/s are too few for the windows of the balance"
-    return [Reason(text, False, (), "slow", then=BY_SMOOTHER)]
-
-
-def _jittering(jitters: Mapping[str, float]) -> list[Reason]:
-    return [
-        Reason(f"stamps of {device} jitter by {1e3 * std:.2g} ms", False, (), "stamps jitter", then=CHECK_STAMPS)
-        for device, std in jitters.items()
-        if std > LARGEST_JITTER
-    ]
-
-
-def _coloured(times: Mapping[str, float]) -> list[Reason]:
-    slow = {channel: time for channel, time in times.items() if time > LONGEST_COLOUR}
-    if not slow:
-        return []
-    of, worst = _largest(slow)
-    text = f"noise of {of} is correlated over {1e3 * worst:.2g} ms"
-    return [Reason(text, False, tuple(slow), "coloured noise", then=CHECK_COLOUR)]
-
-
-def never_received(names: Sequence[str]) -> Reason:
-    """Sources or channels that have never delivered anything."""
-    return Reason(f"nothing was received of {listed(names)}", False, then=CHECK_DEVICE)
-
-
-def silenced(since: Mapping[str, float]) -> list[Reason]:
-    """Sources or channels that deliver nothing any more; since: s."""
-    if not since:
-        return []
-    text = f"nothing has come of {listed([*since])} since {min(since.values()):.1f} s"
-    return [Reason(text, False, then=CHECK_DEVICE)]
-
-
-def troubled(troubles: Sequence[str]) -> list[Reason]:
-    """What keeps samples from coming."""
-    return [Reason(trouble, False, then=CHECK_TROUBLE) for trouble in troubles]
 
 
 def unconverged(why: str) -> Reason:

@@ -18,7 +18,7 @@ from sms_online.checkpoint import Checkpoint
 from sms_online.notices import unstated_latency
 from sms_online.session import Session
 from sms_online.stream import Block
-from sms_online.verdict.reasons import LARGEST_LOSS
+from sms_online.verdict.sample_reasons import LARGEST_LOSS
 from sms_tools.interruption import Interruption
 from sms_tools.live.feed import READ_TIMEOUT, Feed, Interpreter, SessionClock, check_feeds
 from sms_tools.live.latency import RECENT, Latencies
