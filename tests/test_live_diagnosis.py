@@ -20,8 +20,8 @@ from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.online_search import Immediate, search
 from sms_online.diagnosis.searcher import Outcome, Request, Searcher
 from sms_online.errors import InputError
+from sms_online.pipeline.blocks import blocks
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array
 from sms_tools.cli import main
 from sms_tools.live.searches import SearchProcess
@@ -119,7 +119,7 @@ def test_what_falls_due_during_a_search_is_searched_after_it(tmp_path: Path) -> 
             newest.append(float(request.segments[-1].index[-1]) / SYSTEM.sample_rate)
             return super().submit(number, request)
 
-    blocks_a_second = 1.0 / (SYSTEM.windows.momentum / HOPS)
+    blocks_a_second = 1.0 / blocks(SYSTEM, 1.0 / SYSTEM.sample_rate)[1]
     online = OnlineDiagnosis(estimator, Slow(tmp_path, round(2.0 * blocks_a_second)), adopt=False)
     estimator.push(block)
     estimator.finish()

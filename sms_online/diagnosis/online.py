@@ -79,6 +79,7 @@ class OnlineDiagnosis(Observer):
         self._drifts = 0 if estimator.momentum is None else estimator.momentum.bank.accepted  # that have been followed
         self._quiet = False  # what is lacking has been said, and not added to the model
         self._onset: _Onset | None = None  # of the open episode
+        self._rows: Momentum | None = None  # that were there at the last block
         self._agreed = False  # two searches in a row have named the same in the open episode
         self._sure = False  # and nothing else explains it as well, as far as is known
         self._due = 0  # searches of the open episode that were due so far
@@ -145,6 +146,7 @@ class OnlineDiagnosis(Observer):
             time, self._pending = self._pending[1], None
             if done[1] is not None and self._onset is not None:
                 self._hear(Evidence(time, self._now, done[1]))
+        self._withdraw()
         self._notice()
         self._search()
 
@@ -191,6 +193,16 @@ class OnlineDiagnosis(Observer):
 
     def _close(self) -> None:
         self._onset, self._pending, self._agreed, self._sure = None, None, False, False
+
+    def _withdraw(self) -> None:
+        """Withdraw the open episode where rows that were made again, with better weights, hold no more than noise."""
+        momentum, before, self._rows = self._momentum, self._rows, self._momentum
+        if self._onset is None or before is momentum or self.episodes[-1].verdict != "noticed":
+            return
+        if momentum.changes.detector.alarm is None and momentum.test.alarm is None:
+            episode = self.episodes.pop()
+            self._close()
+            self.on_verdict(self._now, f"rows made again with better weights: no more than noise in {episode.row}")
 
     def _notice(self) -> None:
         """Open an episode where rows alarm; in rows that were made without patience, the open one may begin anew."""

@@ -59,20 +59,23 @@ class FirstWeights:
         unweighted, _ = _least_squares(np.concatenate(held[:, 0]))
         if self._gained.any():
             return self._scale_free(held, plain, whiten, [self._nominal, unweighted])
-        weights = self._iterated(unweighted, plain, whiten, PASSES, partly=False)
-        if plain.misfit.any():
+        weights, excess = self._iterated(unweighted, plain, whiten, PASSES, partly=False)
+        if excess.any():
             misfit = plain.misfit
-            described = self._iterated(self._nominal, plain, whiten, PASSES_DESCRIBED, partly=True)
-            if plain.misfit.sum() < misfit.sum():
+            described, other = self._iterated(self._nominal, plain, whiten, PASSES_DESCRIBED, partly=True)
+            if other.sum() < excess.sum():
                 weights = described
             if plain.misfit.any() and misfit.any():
                 weights = self._scale_free(held, plain, whiten, [unweighted, self._nominal])
         return weights
 
-    def _iterated(self, weights: Array, plain: PlainRows, whiten: Whiten, passes: int, partly: bool) -> Array:
-        """β (n,) of fits with weights of the fit before.
+    def _iterated(
+        self, weights: Array, plain: PlainRows, whiten: Whiten, passes: int, partly: bool
+    ) -> tuple[Array, Array]:
+        """β (n,) of fits with weights of the fit before, and what the last leaves over noise (n_v,).
 
-        weights: of the first fit. partly: they take what the rows determine, and keep the rest.
+        weights: of the first fit. partly: they take what the rows determine, and keep the rest. A drift may be behind
+        what is left while `plain` is patient, but not behind parameters that few rows have shrunk.
         """
         plain.misfit = np.zeros_like(plain.misfit)
         for _ in range(passes):
@@ -82,7 +85,7 @@ class FirstWeights:
             beta, known = fitted[self._nuisances :], determined[self._nuisances :]
             plain.judge(fitted)
             weights = np.where(known, beta, weights) if partly else beta
-        return weights
+        return weights, plain.excess(fitted)
 
     def _scale_free(self, held: Array, plain: PlainRows, whiten: Whiten, starts: list[Array]) -> Array:
         """β (n,) of fits by `criterion`, first of the rows as they are.
