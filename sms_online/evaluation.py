@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
 from sms_online.calibration.truncation import left
+from sms_online.effects.possible import not_negative
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import NominalComparison, compare, unit_factors
 from sms_online.physical import PhysicalSet, Projection
@@ -35,8 +36,6 @@ ROUNDED = 1e-9
 LARGEST_ROW_VARIANCE = 1.2
 # Attenuation bias matters where it exceeds this many standard deviations of the estimate.
 LARGEST_BIAS = 1.0
-# Quantities that cannot be negative, as the ends of names.
-POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
 
 def identifiable(beta: Array, std: Array) -> NDArray[np.bool_]:
@@ -273,6 +272,5 @@ class Evaluation:
     def negative(self) -> list[str]:
         """Names of parameters that are negative beyond their interval and cannot be."""
         upper = self.estimate.pi + NORMAL_95 * np.where(self.determined, self.std, np.inf)
-        return [
-            p.name for p, each in zip(self.parameters, upper, strict=True) if each < 0.0 and p.name.endswith(POSITIVE)
-        ]
+        below = [p.name for p, each in zip(self.parameters, upper, strict=True) if each < 0.0]
+        return [name for name in below if not_negative(name)]

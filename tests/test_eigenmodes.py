@@ -9,6 +9,7 @@ from scipy.linalg import eigh
 from sms_adapters.system_file import load_system
 from sms_online.description.bodies import FlexibleLink
 from sms_online.model.eigenmodes import Bending, TipLoad, clamped_loaded_modes, markers, tip_load
+from tests.model_systems import tree
 
 LENGTH, RHO_A, EI = 1.2, 31.42, 1768.8  # the paper's link 1
 
@@ -122,3 +123,13 @@ def test_shipped_links_carry_the_markers_that_they_need(name: str) -> None:
         link = system.links[entry.link - 1]
         assert isinstance(link, FlexibleLink)
         assert link.elements >= entry.markers
+
+
+def test_markers_of_a_tree_carry_what_is_mounted_on_them() -> None:
+    """Link 4 is a free panel; links 2, 3 and 7 are mounted on link 1, and the other arm is none of its load."""
+    system = tree()
+    assert tip_load(system, 4, "bending_z") == TipLoad()
+    carried = sum(getattr(system.links[k], "mass", 0.0) for k in (1, 2, 6))
+    motors = sum(system.motors[k].mass for k in (1, 2))  # type: ignore[union-attr]
+    assert tip_load(system, 1, "bending_z").mass == pytest.approx(carried + motors)
+    assert {entry.link for entry in markers(system)} == {1, 4, 5}

@@ -12,8 +12,10 @@ from sms_online.description.bodies import Inertia, RigidBody
 from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, System
 from sms_online.effects.build import build_model
+from sms_online.effects.catalogue import check_effect
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.event_hypotheses import everything
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum_balance import half_widths
 from sms_online.pipeline.momentum_windows import HOPS
@@ -25,6 +27,7 @@ from sms_tools.report import trust_lines
 from tests.axis import AXIS, DAMPING, INERTIA
 from tests.changed_session import changed_session, noisy
 from tests.evaluated import judged, results_document, standard_deviation
+from tests.model_systems import tree
 from tests.saved import resumed
 
 PLANAR = load_system("paper-planar")
@@ -265,3 +268,13 @@ def test_windows_are_smoothed_with_samples_of_their_side_only() -> None:
     first = estimator.momentum.changes.detector.history[0]
     width = round(SYSTEM.windows.momentum * RATE)
     assert first.end - width - half_widths(width)[-1] >= CHANGE * RATE
+
+
+def test_changes_are_looked_for_where_an_effect_can_act() -> None:
+    """A passive joint has no torque whose zero could change."""
+    system = tree()
+    every = everything(system).effects
+    for effect in every:
+        check_effect(system, effect, effect.key, "tree")
+    offsets = {effect.where for effect in every if effect.name == "torque_offset"}
+    assert offsets == {f"joint_{i}" for i, joint in enumerate(system.joints, start=1) if not joint.passive}

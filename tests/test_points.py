@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -67,6 +69,11 @@ def test_derivatives_of_all_readings_agree_with_differences(model: Model) -> Non
         dx = model.position_rate(x, step)
         assert_allclose((readings(x + dx, v) - readings(x - dx, v)) / 2e-6, by_x[:, :, column], atol=1e-7)
         assert_allclose((readings(x, v + step) - readings(x, v - step)) / 2e-6, by_v[:, :, column], atol=1e-7)
+
+
+def test_models_with_points_go_to_other_processes(model: Model) -> None:
+    """The view is written by one; a diagnosis while the session runs is made by another."""
+    pickle.loads(pickle.dumps(model))
 
 
 def test_points_at_the_ends_of_elements_are_the_default() -> None:

@@ -264,3 +264,18 @@ def test_four_elements_read_at_two_markers_need_no_correction() -> None:
     assert evaluation.statistics.method == "smoother"
     error, bar = error_of(evaluation, TWIST)
     assert abs(error) < min(0.01, 1.96 * bar)
+
+
+@pytest.mark.parametrize("share", [-0.2, 1e-6, 0.02])
+def test_no_stiffness_that_a_link_has_bends_it_by_what_is_described(share: float) -> None:
+    """A poor fit may give a link no stiffness, or a negative one: it would bend by any amount."""
+    system = truncation_alone(with_elements(parse_system(HELD, "held"), 2))
+    model = build_model(system)
+    x = np.repeat(hanging(model), INSTANTS, axis=0)
+    still = np.zeros((INSTANTS, model.layout.n_v))
+    rigid = np.array(["rigidity" in p.name for p in model.parameters])
+    changes = [
+        Truncation(model, 0.02).extend(pi, x, still, np.zeros((INSTANTS, model.n_signals)))[1]
+        for pi in (model.nominal, np.where(rigid, share * model.nominal, model.nominal))
+    ]
+    np.testing.assert_array_equal(changes[1], changes[0])

@@ -27,6 +27,7 @@ from functools import cache
 from typing import TypeVar
 
 import numpy as np
+from scipy.linalg import eigvalsh
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.bodies import FlexibleLink
@@ -43,6 +44,9 @@ FINER = 2
 # Instants in a difference of fourth order, and those behind an instant that a rate of a rate needs.
 STENCIL = 5
 BEHIND = STENCIL - 1
+# A link that is softer than this share of its description in some shape is of a poor fit, or no link at all: it would
+# bend by any amount.
+SOFTEST = 0.1
 # Step of the differences by the link's motion, s: 1e-8 of a rate is lost to curvature, as much to rounding.
 STEP = 1e-4
 
@@ -155,6 +159,7 @@ class Truncation(Stage):
         self._speeds = [layout.speed_names.index(name) for name in self._own.speed_names]
         self._rods = [self._finer_link(model, i) for i in self._links]
         self._dynamics: Dynamics | None = None  # of the last π
+        self._stiffness: list[Array] = []  # of each link, by it
         self.begin_segment()
 
     @property
@@ -192,16 +197,21 @@ class Truncation(Stage):
             return 0, np.zeros((len(x), 2, v.shape[1], 0))
         if self._dynamics is None or not np.array_equal(self._dynamics.pi, pi):
             self._dynamics = self._finer.dynamics(pi)
+            self._stiffness = [self._plausible(self._dynamics, i) for i in self._links]
         dynamics, now = self._dynamics, self.state
         again = min(BEHIND, len(now.instants.x))
         instants = _joined(now.instants, self._instants(dynamics, x, v, signals))
-        links = [
-            _joined(before, self._condensed(dynamics, c, _last(instants, len(x)))) for c, before in enumerate(now.links)
-        ]
+        links = [_joined(before, self._condensed(c, _last(instants, len(x)))) for c, before in enumerate(now.links)]
         changes = [self._change(dynamics, c, instants, link, again + len(x)) for c, link in enumerate(links)]
         # Rates of rates at those that will be known better need as many before them.
         now.instants, now.links = _last(instants, 2 * BEHIND), [_last(link, 2 * BEHIND) for link in links]
         return again, np.stack(changes, axis=3)
+
+    def _plausible(self, dynamics: Dynamics, i: int) -> Array:
+        """Stiffness (n_f', n_f') of link i (from 0), as described where that of π is none that a link has."""
+        q = self._finer.layout.q_f[i]
+        own, described = dynamics.stiffness[q, q], self._finer.dynamics(self._finer.nominal).stiffness[q, q]
+        return own if eigvalsh(own, described)[0] >= SOFTEST else described
 
     def _instants(self, dynamics: Dynamics, x: Array, v: Array, signals: Array) -> FinerInstants:
         """With states of the model as described."""
@@ -210,12 +220,12 @@ class Truncation(Stage):
         finer_x[:, self._positions], finer_v[:, self._speeds] = x, v
         return FinerInstants(finer_x, finer_v, signals, *self._loads(dynamics, finer_x, finer_v, signals))
 
-    def _condensed(self, dynamics: Dynamics, c: int, at: FinerInstants) -> Condensed:
+    def _condensed(self, c: int, at: FinerInstants) -> Condensed:
         """Link of nuisance c."""
         q, K = self._finer.layout.q_f[self._links[c]], len(at.x)
         here, moved = self._finer.chain.elastic(at.x, self._links[c]), STEP * at.v[:, q]
-        stiffness = dynamics.stiffness[q, q]
-        virtual, shape = self._rods[c].condensed(np.concatenate((here, here + moved, here - moved)), stiffness)
+        about = np.concatenate((here, here + moved, here - moved))
+        virtual, shape = self._rods[c].condensed(about, self._stiffness[c])
         return Condensed(virtual[:K], (virtual[K : 2 * K] - virtual[2 * K :]) / (2.0 * STEP), shape[:K])
 
     def _change(self, dynamics: Dynamics, c: int, instants: FinerInstants, link: Condensed, count: int) -> Array:

@@ -12,10 +12,10 @@ from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import improved
 from sms_online.diagnosis.folds import Folds
-from sms_online.diagnosis.possible import not_negative
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.shape import refine
 from sms_online.diagnosis.trace import MOST_EFFECTS, Tracing
+from sms_online.effects.possible import not_negative
 from sms_online.effects.traits import INEXACT
 from sms_online.row_types import row_types
 from sms_online.stream import Array

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.diagnosis.evidence import least_squares
-from sms_online.diagnosis.possible import not_negative
 from sms_online.diagnosis.record import Segment, excerpts
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.scale_free import HomogeneousRows
 from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows, WindowPlaces
 from sms_online.effects.friction import sign
+from sms_online.effects.possible import not_negative
 from sms_online.model.effect import Inputs
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import EXPONENT

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from functools import partial
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -167,15 +168,16 @@ class LinearLink:
         displacement, theta = fields[:, :3], fields[:, 3:]
         straight = stations[:, None] * np.array([1.0, 0.0, 0.0])
 
-        def at_stations(q_f: Array) -> Sections:
-            center = straight + (displacement @ q_f[:, None, :, None])[..., 0]
-            angle = (theta @ q_f[:, None, :, None])[..., 0]
-            if self.first_order:
-                return Sections(center, np.eye(3) + so3.skew(angle), displacement[None], theta[None])
-            turn = so3.RotationVector(angle)
-            return Sections(center, turn.matrix, displacement[None], turn.left_jacobian @ theta)
+        # No local function: models go to other processes.
+        return partial(self._at_stations, straight, displacement, theta)
 
-        return at_stations
+    def _at_stations(self, straight: Array, displacement: Array, theta: Array, q_f: Array) -> Sections:
+        center = straight + (displacement @ q_f[:, None, :, None])[..., 0]
+        angle = (theta @ q_f[:, None, :, None])[..., 0]
+        if self.first_order:
+            return Sections(center, np.eye(3) + so3.skew(angle), displacement[None], theta[None])
+        turn = so3.RotationVector(angle)
+        return Sections(center, turn.matrix, displacement[None], turn.left_jacobian @ theta)
 
     def markers(self, q_f: Array) -> Array:
         """The nodal coordinates themselves, (B, n_f)."""

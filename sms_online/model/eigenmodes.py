@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 from sms_online.description.bodies import FlexibleLink, RigidBody
 from sms_online.description.schema import System
+from sms_online.description.tree import tree_of
 from sms_online.stream import Array
 
 Bending = Literal["bending_y", "bending_z"]
@@ -98,13 +99,12 @@ def _frequency_equation(lam: float, mass: float, moment: float, inertia: float) 
 
 
 def tip_load(system: System, i: int, plane: Bending) -> TipLoad:
-    """Load on link i (from 1) by the motors, links and payload after it; arm straight: mounts unturned, angles zero.
+    """Load on link i (from 1) by what it carries, payload included; arm straight: mounts unturned, angles zero.
 
     Rotors turn with their stators, for the joints are held.
     """
     axis = "zz" if plane == "bending_z" else "yy"
     across = 1 if plane == "bending_z" else 2
-    end = np.zeros(3)
     mass = first_moment = inertia = 0.0
 
     def add(m: float, center: Array, about_center: float) -> None:
@@ -113,22 +113,27 @@ def tip_load(system: System, i: int, plane: Bending) -> TipLoad:
         first_moment += m * float(center[0])
         inertia += about_center + m * float(center[0] ** 2 + center[across] ** 2)
 
-    def add_body(body: RigidBody) -> None:
-        add(body.mass, end + np.array(body.center_of_mass), getattr(body.inertia, axis))
+    def add_body(body: RigidBody, at: Array) -> None:
+        add(body.mass, at + np.array(body.center_of_mass), getattr(body.inertia, axis))
 
-    for joint, motor, link in list(zip(system.joints, system.motors, system.links, strict=True))[i:]:
+    tree, ends = tree_of(system), {i - 1: np.zeros(3)}
+    for k in tree.outwards:
+        if k in ends or tree.parents[k] not in ends:
+            continue
+        root, link = ends[tree.parents[k]], system.links[k]
+        motor = system.motors[k] if k < len(system.motors) else None  # fixed joints have none
         if motor is not None:
-            rotor = joint.axis["xyz".index(axis[0])] ** 2 * motor.rotor_inertia
-            add(motor.mass, end, getattr(motor.stator_inertia, axis) + rotor)
+            rotor = system.joints[k].axis["xyz".index(axis[0])] ** 2 * motor.rotor_inertia
+            add(motor.mass, root, getattr(motor.stator_inertia, axis) + rotor)
         if isinstance(link, FlexibleLink):
-            m = link.mass_per_length * link.length
-            add(m, end + np.array([0.5 * link.length, 0.0, 0.0]), m * link.length**2 / 12.0)
-            end = end + np.array([link.length, 0.0, 0.0])
+            m, along = link.mass_per_length * link.length, np.array([link.length, 0.0, 0.0])
+            add(m, root + 0.5 * along, m * link.length**2 / 12.0)
+            ends[k] = root + along
         else:
-            add_body(link)
-            end = end + np.array(link.tip)
-    if system.payload is not None:
-        add_body(system.payload)
+            add_body(link, root)
+            ends[k] = root + np.array(link.tip)
+    if system.payload is not None and tree.last in ends:
+        add_body(system.payload, ends[tree.last])
     return TipLoad(mass, first_moment, inertia)
 
 

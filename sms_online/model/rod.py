@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from functools import partial
 
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial
@@ -134,21 +135,21 @@ class ExactRod:
 
     def sections(self, stations: Array) -> Callable[[Array], Sections]:
         """Sections at stations (n,), m from the root."""
-        G, integrate = self._G, _cumulative_integration(self.length, *self._gauss, stations)
+        # No local function: models go to other processes.
+        return partial(self._at_stations, _cumulative_integration(self.length, *self._gauss, stations))
 
-        def at_stations(q_f: Array) -> Sections:
-            R = self._rotations(q_f)[:, :G]
-            kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)
-            turning = R[..., self._axis] * self._chi[:, None, :]
-            tangent = R[..., 0]
-            return Sections(
-                center=_along(integrate, tangent),
-                rotation=np.eye(3) + _along(integrate, R @ so3.skew(kappa)),
-                J=_along(integrate, _cross_columns(_along(self._integrate[:G], turning), tangent)),
-                spin=_along(integrate, turning),
-            )
-
-        return at_stations
+    def _at_stations(self, integrate: Array, q_f: Array) -> Sections:
+        G = self._G
+        R = self._rotations(q_f)[:, :G]
+        kappa = np.tensordot(q_f, self._fields, axes=(1, 0)).transpose(0, 2, 1)
+        turning = R[..., self._axis] * self._chi[:, None, :]
+        tangent = R[..., 0]
+        return Sections(
+            center=_along(integrate, tangent),
+            rotation=np.eye(3) + _along(integrate, R @ so3.skew(kappa)),
+            J=_along(integrate, _cross_columns(_along(self._integrate[:G], turning), tangent)),
+            spin=_along(integrate, turning),
+        )
 
     def _one_field_markers(self) -> _OneFieldMarkers:
         G, angles = self._G, self._integrate @ self._chi

@@ -75,7 +75,7 @@ class NoiseBias(State):
         """All of them (C, n + 1, n + 1), in order of time."""
         return np.array(self.whole if self.joined == 0 else [*self.whole, self.last]).reshape(-1, *self.gram.shape)
 
-    def correction(self, determined: NDArray[np.bool_]) -> tuple[Array, Array]:
+    def correction(self, determined: NDArray[np.bool_], lost_unknown: bool = False) -> tuple[Array, Array]:
         """What to add to the least-squares estimate (n,) to free it of this bias, and to its covariance (n, n).
 
         The synthetic noise is one sample, so the shift scatters. As much of it is given as is no scatter: a bias that
@@ -117,7 +117,8 @@ class NoiseBias(State):
         kept = directions[:, ~lost]
         whole = kept @ ((kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost])
         apart = np.abs(1.0 - share[lost])
-        attenuated = along[lost] * np.clip(share[lost] / np.maximum(apart, 1.0 / LARGEST_FACTOR), 1.0, LARGEST_FACTOR)
+        factor = np.clip(share[lost] / np.maximum(apart, 1.0 / LARGEST_FACTOR), 1.0, LARGEST_FACTOR)
+        attenuated = along[lost] * (LARGEST_FACTOR if lost_unknown else factor)
         # Each cluster's part of it, to first order.
         parts = kept @ (kept.T @ (clusters[:, :-1] @ np.append(directions @ along, -1.0)).T)
         count = parts.shape[1]
@@ -149,9 +150,9 @@ class NoiseBias(State):
         self.whole = [widened(cluster) for cluster in self.whole]
 
 
-def unbiased(estimate: Estimate, bias: NoiseBias) -> Estimate:
+def unbiased(estimate: Estimate, bias: NoiseBias, lost_unknown: bool = False) -> Estimate:
     """An estimate free of what noise in the columns does; one that was weighted against a prior stays as it is."""
     if estimate.scale is not None:
         return estimate
-    shift, covariance = bias.correction(estimate.determined)
+    shift, covariance = bias.correction(estimate.determined, lost_unknown)
     return replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + covariance)

@@ -16,7 +16,7 @@ import numpy as np
 from sms_online.description.bodies import RigidBody
 from sms_online.description.schema import Effect, System
 from sms_online.effects.build import build_model
-from sms_online.effects.catalogue import BEGINNING, ENTRIES
+from sms_online.effects.catalogue import BEGINNING, ENTRIES, places
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -77,10 +77,11 @@ class Explanation:
 
 
 def everything(system: System) -> System:
-    """The system with a payload, and with every effect that may begin in a session at every joint."""
+    """The system with a payload, and with every effect that may begin in a session at every joint that can have it."""
     declared = {effect.key for effect in system.effects}
+    at = {name: places(system, ENTRIES[name].at) for name in BEGINNING}
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
-    every = [Effect(name=name, where=where) for where in joints for name in BEGINNING]
+    every = [Effect(name=name, where=where) for where in joints for name in BEGINNING if where in at[name]]
     missing = [effect for effect in every if effect.key not in declared]
     payload = RigidBody() if system.payload is None else system.payload
     return system.model_copy(update={"payload": payload, "effects": (*system.effects, *missing)})

@@ -110,6 +110,13 @@ class JointEstimate(Stage):
         squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
         return self._unbiased(squares) if scale_free is None else scale_free.solved(squares)
 
+    def for_weights(self, fit: MomentumFit) -> Estimate:
+        """The same, with nothing known where noise makes most of what is."""
+        squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
+        if scale_free is not None:
+            return scale_free.solved(squares)
+        return released(unbiased(squares, self.bias, lost_unknown=True), self._nuisances, squares.covariance)
+
     def _unbiased(self, squares: Estimate) -> Estimate:
         return released(unbiased(squares, self.bias), self._nuisances, squares.covariance)
 

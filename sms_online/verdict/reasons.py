@@ -92,7 +92,7 @@ def unnamed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
 def passed(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
     """Residuals that exceeded their predicted noise for a time."""
     return [
-        Reason(f"the residual of {each.row} exceeded its predicted noise for a time", False)
+        Reason(f"the residual of {each.row} exceeded its predicted noise for a time", False, then=DIAGNOSE)
         for each in discrepancies
         if each.verdict == "passed"
     ]
@@ -228,7 +228,7 @@ def attenuated(names: Sequence[str]) -> list[Reason]:
         return []
     text = f"sensor noise biases {listed(names)} beyond the error bar"
     full = f"sensor noise in the columns biases {', '.join(names)} by more than the error bar"
-    return [Reason(text, False, full=full)]
+    return [Reason(text, False, full=full, then=MOVE)]
 
 
 def undecided_changes(times: Sequence[float]) -> list[Reason]:

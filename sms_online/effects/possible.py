@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from sms_online.effects.catalogue import ENTRIES
-from sms_online.evaluation import POSITIVE
+
+# Quantities of a model without effects that cannot be negative, as the ends of names.
+POSITIVE = ("mass", "mass_per_length", "stiffness", "damping", "rotor_inertia", "rigidity", "rigidity_y", "rigidity_z")
 
 
 def not_negative(name: str) -> bool:
