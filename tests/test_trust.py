@@ -13,7 +13,7 @@ from sms_online.row_types import Residual
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
 from sms_online.verdict.reasons import CHECK_ROWS, MOVE, place_of
-from sms_online.verdict.trust import LONGEST_SENTENCE
+from sms_online.verdict.trust import LONGEST_SENTENCE, Reason
 from tests.axis import AXIS, axis_block
 from tests.evaluated import judged, results_document
 from tests.sessions_of import session_of
@@ -127,6 +127,13 @@ def test_the_named_effect_comes_before_its_residual() -> None:
     assert judgement.marks == {"joint_2": "coulomb friction"}
 
 
+def test_what_the_model_lacks_is_said_in_place_of_calibration_errors() -> None:
+    off = Reason("link_1.marker_2: place -74 ± 5 mm off", True)
+    judgement = judge(replace(GOOD, discrepancies=(LACKING,), miscalibrated=(off,)))
+    assert off.text not in (judgement.sentence, *judgement.reasons)
+    assert off in judge(replace(GOOD, miscalibrated=(off,))).grounds
+
+
 def test_lost_samples_come_before_their_residual() -> None:
     judgement = judge(replace(with_row("joint_2", whitened=19.0), lost=0.02))
     assert judgement.sentence == "Do not trust: 2 % of the samples are lost"
@@ -238,6 +245,8 @@ def test_what_nothing_explains_is_marked_where_it_acts() -> None:
     judgement = judge_diagnosis("unexplained", [], "link_1", TRUSTED)
     assert judgement.grave
     assert judgement.marks == {"link_1": "unexplained"}
+    assert "diagnose --learn" in judgement.next_step
+    assert "diagnose --learn" not in judge_diagnosis("unexplained", [], "link_1", TRUSTED, learned=True).next_step
 
 
 def test_an_effect_that_does_not_explain_all_is_called_near() -> None:

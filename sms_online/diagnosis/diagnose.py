@@ -65,7 +65,7 @@ def diagnose(
     before, record = _session(
         system, runs, source, prior, lambda share: progress("fitting the model as described", FITTED_ONCE * share)
     )
-    _check_measured(before, source)
+    _check_noise(before, source)
     progress("looking for mistakes of units, signs and wiring", FITTED_ONCE)
     corrected = find_mistakes(before, record.segments())
     mistakes = (*([] if clock is None else [clock]), *corrected.mistakes)
@@ -74,7 +74,7 @@ def diagnose(
         system = corrected.system
         runs, holdout = [undone(run, corrected) for run in runs], undone(holdout, corrected)
         before, record = _session(system, runs, source, prior)
-        _check_measured(before, source)
+        _check_noise(before, source)
     assert before.momentum is not None
     assert before.momentum.sensor_noise is not None
     held = _session(system, [holdout], source, prior)[1].segments() if holdout else []
@@ -248,13 +248,16 @@ def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
     return tuple(each for each in every if each.beyond and each.name not in sayable(session.system))
 
 
-def _check_measured(session: Estimator, source: str) -> None:
+def _check_balanced(session: Estimator, source: str) -> None:
     if session.momentum is None:
         lacking = f"no {session.sensing.missing[0]}" if session.sensing.missing else 'balance = "energy"'
         raise InputError(
             source, "", f"{lacking}, so no momentum balance", "a system whose coordinates are all measured"
         )
-    if session.momentum.sensor_noise is None:
+
+
+def _check_noise(session: Estimator, source: str) -> None:
+    if session.momentum is not None and session.momentum.sensor_noise is None:
         raise InputError(source, "", "too few samples to estimate the sensors' noise", "a longer capture")
 
 
@@ -282,6 +285,7 @@ def _session(
     progress: is called with the share of the samples processed.
     """
     estimator = Estimator(system, runs[0][0].channels, source, whole=True)
+    _check_balanced(estimator, source)
     record = SampleRecord(system.sample_rate)
     estimator.observers.append(record)
     known = prior(estimator)

@@ -131,7 +131,7 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
     after = evaluated(diagnosis.estimator_after) if after is None else after
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
-    rest = _after(diagnosis, after)
+    rest, learned = _after(diagnosis, after), diagnosis.attempt.case.learned
     if diagnosis.drifts:
         if diagnosis.estimator_after is not diagnosis.estimator_before:
             rest = trust_with(diagnosis.drifts, rest)
@@ -141,9 +141,9 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
         off = tuple(Reason(f"{each}: beyond its tolerance", False, then=each.advice) for each in diagnosis.calibration)
         return rest if rest.level != "trust" else Trust("doubt", off)
     if not diagnosis.mistakes:
-        return judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis), _undecided(diagnosis))
+        return judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis), _undecided(diagnosis), learned)
     if effects or row is not None:
-        rest = judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis), _undecided(diagnosis))
+        rest = judge_diagnosis(diagnosis.verdict, effects, row, rest, _near(diagnosis), _undecided(diagnosis), learned)
     # The numbers are those of corrected samples: as recorded, or as described, they would be wrong without limit.
     wrong = [Reason(m.sentence, True, tuple(m.where.split(", ")), "a mistake", then=m.step) for m in diagnosis.mistakes]
     return Trust("doubt", (*wrong, *(rest.grounds if rest.level != "trust" else ())), grave=True)

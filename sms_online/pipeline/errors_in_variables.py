@@ -87,8 +87,8 @@ class NoiseBias(State):
         score by the same function of a noise of the same law. Even orders of Gaussian noise do not correlate with odd
         ones, so the variances add: that of the second order to that of the first, and to both that of the shift.
         Where noise makes most of the information along a direction, the motion does not determine it: least squares
-        attenuate it by an unknown factor. There the shift is zero and its size a deviation. Zero where nothing is
-        determined.
+        attenuate it by an unknown factor. There the shift is zero and its size a deviation; of the largest factor for
+        `lost_unknown`, so that anything else that is known prevails. Zero where nothing is determined.
         """
         shift, covariance = np.zeros(determined.size), np.zeros((determined.size, determined.size))
         known = np.flatnonzero(determined)

@@ -111,7 +111,11 @@ class JointEstimate(Stage):
         return self._unbiased(squares) if scale_free is None else scale_free.solved(squares)
 
     def for_weights(self, fit: MomentumFit) -> Estimate:
-        """The same, with nothing known where noise makes most of what is."""
+        """The same, with nothing known along directions whose information noise makes.
+
+        Least squares attenuate there. Weights that followed would predict less noise, so that the next estimate is
+        attenuated further and looks better determined.
+        """
         squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
         if scale_free is not None:
             return scale_free.solved(squares)

@@ -23,6 +23,9 @@ def judge(evidence: Evidence) -> Trust:
     What has been shown to be wrong counts from when it is shown. Residuals of an estimate that has not converged show
     nothing: it was made of other, poorer rows.
     """
+    if reasons.lacking(evidence.discrepancies):
+        # What the model lacks looks like errors of calibration as well.
+        evidence = replace(evidence, miscalibrated=())
     alarmed = _alarmed(evidence)
     wrong = _wrong(evidence, alarmed)
     # Faults of the samples come before what they may have done to the estimate.
@@ -98,13 +101,14 @@ def judge_diagnosis(
     after: Trust,
     near: bool = False,
     either: Sequence[Reason] = (),
+    learned: bool = False,
 ) -> Trust:
     """The verdict on a diagnosed capture.
 
     verdict: `clean`, `named` or `unexplained`. effects: what was named, `name@where`. row: type of the rows that
     what is not explained acts on. after: of the session with what was named. near: whether effects that are named
     in an unexplained session leave little of it. either: what was named that may as well be elsewhere, and scales
-    the parameters differently there.
+    the parameters differently there. learned: curves were tried as well.
     """
     if verdict == "clean":
         return after
@@ -112,21 +116,22 @@ def judge_diagnosis(
     if verdict == "unexplained" and noisy and not (effects or after.grave):
         text = "no known effect explains what is left, which does not last: noise of torques, or a fast force"
         return Trust("doubt", (Reason(text, False, noisy[0].places, "unexplained", then=noisy[0].then), *after.grounds))
-    found = _unexplained(effects, row, near) if verdict == "unexplained" else _named(effects, after, either)
+    found = _unexplained(effects, row, near, learned) if verdict == "unexplained" else _named(effects, after, either)
     # The session with what was named says so too.
     rest = [reason for reason in after.grounds if not (either and reason.mark == reasons.UNDECIDED)]
     rest = rest if after.level != "trust" else []
     return Trust("doubt", (*found, *rest), grave=found[0].grave)
 
 
-def _unexplained(effects: Sequence[str], row: str | None, near: bool) -> list[Reason]:
+def _unexplained(effects: Sequence[str], row: str | None, near: bool, learned: bool) -> list[Reason]:
     """Reasons where no known effect explains what acts, or not all of it."""
     where = "" if row is None else f" on {row}"
     like = reasons.listed(effects)
     text = f"a force{where} that no known effect explains"
     if near:
         text = f"{like} explain{'s' * (len(effects) == 1)} most of what acts{where}, not all"
-    found = [Reason(text, True, () if row is None else (row,), "unexplained", then=reasons.DESCRIBE)]
+    then = reasons.NO_CURVE if learned else reasons.DESCRIBE
+    found = [Reason(text, True, () if row is None else (row,), "unexplained", then=then)]
     # These are no findings, so they are not listed one by one.
     return found if near or not effects else [*found, Reason(f"some of it looks like {like}", True)]
 
