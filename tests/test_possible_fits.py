@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
 
 from sms_online.diagnosis.evidence import bounded
-from sms_online.diagnosis.possible import not_negative
+from sms_online.effects.possible import not_negative
 
 POSITIVE = np.array([True, False, True, True, False])
 
