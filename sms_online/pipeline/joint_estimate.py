@@ -107,8 +107,7 @@ class JointEstimate(Stage):
 
     def solved(self, fit: MomentumFit) -> Estimate:
         """The same without what only error bars take, for weights that follow the estimate."""
-        squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
-        return self._unbiased(squares) if scale_free is None else scale_free.solved(squares)
+        return self._solved(fit)
 
     def for_weights(self, fit: MomentumFit) -> Estimate:
         """The same, with nothing known along directions whose information noise makes.
@@ -116,13 +115,14 @@ class JointEstimate(Stage):
         Least squares attenuate there. Weights that followed would predict less noise, so that the next estimate is
         attenuated further and looks better determined.
         """
-        squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
-        if scale_free is not None:
-            return scale_free.solved(squares)
-        return released(unbiased(squares, self.bias, lost_unknown=True), self._nuisances, squares.covariance)
+        return self._solved(fit, lost_unknown=True)
 
-    def _unbiased(self, squares: Estimate) -> Estimate:
-        return released(unbiased(squares, self.bias), self._nuisances, squares.covariance)
+    def _solved(self, fit: MomentumFit, lost_unknown: bool = False) -> Estimate:
+        squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
+        return self._unbiased(squares, lost_unknown) if scale_free is None else scale_free.solved(squares)
+
+    def _unbiased(self, squares: Estimate, lost_unknown: bool = False) -> Estimate:
+        return released(unbiased(squares, self.bias, lost_unknown), self._nuisances, squares.covariance)
 
     def row_variance(self, fit: MomentumFit) -> float:
         """Mean square of what the rows leave, in units of their predicted variance."""
