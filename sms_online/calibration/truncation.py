@@ -197,7 +197,7 @@ class Truncation(Stage):
             return 0, np.zeros((len(x), 2, v.shape[1], 0))
         if self._dynamics is None or not np.array_equal(self._dynamics.pi, pi):
             self._dynamics = self._finer.dynamics(pi)
-            self._stiffness = [self._plausible(self._dynamics, i) for i in self._links]
+            self._stiffness = self._plausible(self._dynamics)
         dynamics, now = self._dynamics, self.state
         again = min(BEHIND, len(now.instants.x))
         instants = _joined(now.instants, self._instants(dynamics, x, v, signals))
@@ -207,11 +207,13 @@ class Truncation(Stage):
         now.instants, now.links = _last(instants, 2 * BEHIND), [_last(link, 2 * BEHIND) for link in links]
         return again, np.stack(changes, axis=3)
 
-    def _plausible(self, dynamics: Dynamics, i: int) -> Array:
-        """Stiffness (n_f', n_f') of link i (from 0), as described where that of π is none that a link has."""
-        q = self._finer.layout.q_f[i]
-        own, described = dynamics.stiffness[q, q], self._finer.dynamics(self._finer.nominal).stiffness[q, q]
-        return own if eigvalsh(own, described)[0] >= SOFTEST else described
+    def _plausible(self, dynamics: Dynamics) -> list[Array]:
+        """Stiffness (n_f', n_f') of each link, as described where that of π is none that a link has."""
+        described, out = self._finer.dynamics(self._finer.nominal).stiffness, []
+        for q in (self._finer.layout.q_f[i] for i in self._links):
+            softest = eigvalsh(dynamics.stiffness[q, q], described[q, q])[0]
+            out.append((dynamics.stiffness if softest >= SOFTEST else described)[q, q])
+        return out
 
     def _instants(self, dynamics: Dynamics, x: Array, v: Array, signals: Array) -> FinerInstants:
         """With states of the model as described."""
