@@ -15,7 +15,7 @@ from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.catalogue import channel_effects
 from sms_online.effects.channel import EncoderEccentricity
-from sms_online.effects.delay import SensorLag, TorqueDelay
+from sms_online.effects.delay import ActuatorDelay, SensorLag, TorqueDelay
 from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import Conditioning
 from sms_online.pipeline.synchronise import GridSamples
@@ -93,6 +93,17 @@ def test_a_late_torque_is_given_back() -> None:
     M = delay.kernel(1000.0).size // 2
     assert_allclose(delay.correct(late, 1000.0)[M:-M], np.sin(omega * t)[M:-M], rtol=0, atol=3 / 128 * 0.0189**4)
     assert_allclose(delay.distort(np.sin(omega * t), 1000.0)[20:], late[20:], rtol=0, atol=5e-5)
+
+
+def test_a_torque_that_acts_late_is_moved_to_when_it_acts() -> None:
+    t, dead = np.arange(4000) / 1000.0, ActuatorDelay("joint_*", {"time": 0.0123})
+    assert dead.acts_on("tau_2")
+    assert dead.latency == -0.0123
+    omega = 2 * np.pi * 3.0
+    read = np.sin(omega * (t + 0.0123))
+    M = dead.kernel(1000.0).size // 2
+    assert_allclose(dead.correct(read, 1000.0)[M:-M], np.sin(omega * t)[M:-M], rtol=0, atol=3 / 128 * 0.0189**4)
+    assert_allclose(dead.distort(np.sin(omega * t), 1000.0)[:-20], read[:-20], rtol=0, atol=5e-5)
 
 
 def test_conditioning_is_independent_of_blocks_and_restarts() -> None:

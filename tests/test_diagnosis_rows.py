@@ -80,6 +80,7 @@ def test_whitened_rows_give_the_estimate_of_the_stream() -> None:
         (Effect(name="encoder_offset", where="q_1", coefficients={"offset": 1e-3}), 1e-3),
         (Effect(name="sensor_lag", where="theta_m_2", coefficients={"corner": 150.0}), np.sqrt(2.0) / (300.0 * np.pi)),
         (Effect(name="torque_delay", where="joint_2", coefficients={"time": 5e-4}), 5e-4),
+        (Effect(name="actuator_delay", where="joint_*", coefficients={"time": 5e-4}), 5e-4),
     ],
 )
 @pytest.mark.slow

@@ -53,6 +53,7 @@ def test_a_zero_is_off_by_less_than_a_turn() -> None:
 def test_what_a_held_command_does_is_no_sensor_s_lag() -> None:
     assert not plausible("sensor_lag", 4e-4)
     assert plausible("sensor_lag", 4e-4, sample_rate=2000.0)
+    assert not plausible("actuator_delay", 4e-4)
 
 
 def test_a_force_reverses_where_it_follows_its_rate_s_sign() -> None:

@@ -63,6 +63,8 @@ class MovingArm:
         x, _ = plant.split(plant.rest[None])
         # Before the start the arm rests; the first rows are what the most delayed sensor still shows then.
         delays = np.rint(sensors.latency * rate).astype(np.int64)
+        # Where commands act later than they are read everything else comes late: nobody knows the torque of tomorrow.
+        delays -= min(0, delays.min(initial=0))
         longest = int(delays.max(initial=0))
         rest = plant.channel_values(np.zeros((1, plant.model.n_inputs)), x)[:, columns]
         history = np.repeat(rest, longest + 1, axis=0)

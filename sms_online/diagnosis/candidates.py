@@ -22,7 +22,7 @@ from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows
 from sms_online.effects.base import Ranges, joints_of, position
 from sms_online.effects.build import build_model, declaring
-from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, traits_of
+from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, places, traits_of
 from sms_online.model.effect import Inputs
 from sms_online.model.model import Model
 from sms_online.model.parameters import Parameter
@@ -343,13 +343,13 @@ class CandidateColumns:
         return declaring(self.system, [effect])
 
     def _torque_rate(self, where: str) -> Array:
-        """∫ φ d(n τ)/dt dt of a joint in its motor's row (W, n_v), differentiated by way of φ."""
-        i = index_of(where)
-        motor = self.rows.model.layout.theta_m[i]
+        """∫ φ d(n τ)/dt dt of the joints that `where` matches, in their motors' rows (W, n_v), by way of dφ/dt."""
+        joints = [index_of(joint) for joint in places(self.system, "driven joint") if fnmatchcase(joint, where)]
+        motors = [self.rows.model.layout.theta_m[i] for i in joints]
 
         def columns(motion: SeenMotion) -> tuple[Array, Array]:
             P = np.zeros((*motion.v.shape, 1))
-            P[:, motor, 0] = motion.torque[:, i]
+            P[:, motors, 0] = motion.torque[:, joints]
             return P, np.zeros_like(P)
 
         return self._weak.columns(columns, dense=True)[..., 0]

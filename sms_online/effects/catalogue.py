@@ -18,7 +18,7 @@ from sms_online.description.tree import index_of
 from sms_online.effects.base import Constant, Entry, Place, Site
 from sms_online.effects.channel import ChannelEffect, EncoderEccentricity, EncoderOffset, Linear
 from sms_online.effects.coupled import CoupledFriction, CoupledInertia, GravitySpring
-from sms_online.effects.delay import LONGEST_DELAY, SensorLag, SensorLatency, TorqueDelay
+from sms_online.effects.delay import LONGEST_DELAY, ActuatorDelay, SensorLag, SensorLatency, TorqueDelay
 from sms_online.effects.drive import Cogging, TorqueGain, TorqueOffset, TorqueRipple
 from sms_online.effects.friction import (
     CoulombFriction,
@@ -43,7 +43,7 @@ FORCES = (
     ReactionWheel, ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
     CoupledFriction, GravitySpring, LearnedForce,
 )  # fmt: skip
-CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay)
+CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay, ActuatorDelay)
 INERTIAS = (TipPayload, CoupledInertia)
 CLASSES = (*FORCES, *INERTIAS, *CHANNELS)
 _CLASSES: tuple[type[object], ...] = CLASSES  # of one type, of which some are constants
@@ -143,7 +143,7 @@ def check_effect(system: System, effect: Effect, place: str, source: str) -> Non
             raise InputError(source, place, f"coefficient {name!r} of {effect.name}", expected)
         if name in entry.shapes and value <= 0.0 < entry.shapes[name].default:
             raise InputError(source, place, f"{name} = {value:g} of {effect.name}", "a number greater than 0")
-        if name == "time" and effect.name == TorqueDelay.entry.name and not 0.0 <= value <= LONGEST_DELAY:
+        if name == "time" and entry.kind == "channel" and not 0.0 <= value <= LONGEST_DELAY:
             raise InputError(source, place, f"{name} = {value:g} s of {effect.name}", f"0 to {LONGEST_DELAY:g} s")
 
 
@@ -287,6 +287,9 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     gauges = [strip for strip in strips if strip is not None]
     if entry.name == EncoderOffset.entry.name:
         return (*places(system, "angle"), *gauges)
+    if entry.name == ActuatorDelay.entry.name and len(joints := places(system, entry.at)) > 1:
+        # The dead time of a controller, and that of one drive.
+        return ("joint_*", *joints)
     if entry.name != SensorLag.entry.name:
         return places(system, entry.at)
     positions = places(system, "position")

@@ -1,4 +1,4 @@
-"""Channels that come late: a lag of positions, a delay of torques."""
+"""Channels that come late: a lag of positions, a delay of torques, or of what they do."""
 
 from __future__ import annotations
 
@@ -166,6 +166,37 @@ class TorqueDelay(Convolved):
     def possible(cls, given: Mapping[str, float], sample_rate: float) -> bool:
         """Whether it is the delay of a drive."""
         return cls.entry.traits.plausible(np.array([given["time"]]), sample_rate)
+
+
+class ActuatorDelay(TorqueDelay):
+    """A torque that acts d after its reading, which is τ(t + d): the dead time of a drive. d `time` ≥ 0, s.
+
+    All positions that come late by d look the same. Where a bus is simulated everything else comes late.
+    Limitations: those of `TorqueDelay`; up to half a sample it is a command that is held.
+    """
+
+    entry = Entry(
+        "actuator_delay", "channel", "driven joint", {"time": "s"}, "fast reversals of the torque",
+        traits=Traits(most=LONGEST_FOUND, behind=HELD, calibrates=("clock",)),
+        said=lambda where, given: (
+            f"the torque of {where} acts {1e3 * given['time']:.3g} ms after its reading, or every position is that late"
+        ),
+    )  # fmt: skip
+    linear = (Linear("time", "s", "torque rate", 1.0),)
+
+    @property
+    def latency(self) -> float:
+        """-d, s."""
+        return -self.coefficients["time"]
+
+    def distort(self, samples: Array, sample_rate: float) -> Array:
+        """τ(t + d), the last sample behind the record."""
+        seconds = np.arange(samples.size) / sample_rate
+        return np.asarray(np.interp(seconds + self.coefficients["time"], seconds, samples))
+
+    def kernel(self, sample_rate: float) -> Array:
+        """Weights (2M + 1,) of the samples about an instant in the value d earlier."""
+        return ahead(-self.coefficients["time"], sample_rate)
 
 
 class SensorLatency(Convolved):

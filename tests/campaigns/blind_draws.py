@@ -90,7 +90,8 @@ class Draw:
 
     def _stated(self, name: str, where: str, linear: Array, shapes: dict[str, float]) -> dict[str, float]:
         """The coefficients that give these linear ones."""
-        joint = self.system.joints[int(where.removeprefix("joint_")) - 1] if where.startswith("joint_") else None
+        number = where.removeprefix("joint_")
+        joint = self.system.joints[int(number) - 1] if number.isdigit() else None
         link = self.system.links[int(where.removeprefix("link_")) - 1] if where in ("link_1", "link_2") else None
         value = float(linear[0])
         size, phase = float(np.hypot(*linear[:2])) if linear.size > 1 else 0.0, 0.0
