@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sms_online.diagnosis.candidate_fits import Key
 from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.evidence import least_squares_without
 from sms_online.stream import Array
+
+# Rows without a torque whose terms are smaller than this share of their usual size have drawn the parameters to zero.
+SHRUNK = 0.1
 
 
 class HeldOutRows(CandidateRows):
@@ -40,13 +44,24 @@ class HeldOutRows(CandidateRows):
         return left
 
     def _sized(self, chosen: Sequence[int], solution: Array) -> Array:
-        """What is left (W, n_v), rows without a torque that leave more than noise as if they had their usual size."""
+        """What is left (W, n_v), rows without a torque as if they had their usual size.
+
+        Where they leave more than noise whatever is added, and where a fit that lacks something has shrunk them.
+        """
         left = self.residual(chosen, solution)
-        if np.any(self._homogeneous):
+        if np.any(self._scale.homogeneous):
             terms = self._terms(chosen, solution)
-            sized = self._homogeneous & (terms > 0.0)
+            sized = (self._homogeneous | self._shrunk(terms)) & (terms > 0.0)
             left[:, sized] *= np.sqrt(self._usual[sized] / terms[sized])
         return left
+
+    def _shrunk(self, terms: Array) -> NDArray[np.bool_]:
+        """Speeds (n_v,) whose rows have no torque and terms of these sums of squares (n_v,) that are far too small."""
+        return np.asarray(self._scale.homogeneous & (terms < SHRUNK**2 * self._usual))
+
+    def shrinks(self, chosen: Sequence[int]) -> bool:
+        """Whether the fit beside those chosen shrinks the parameters: its rows hold more than noise, and draw them."""
+        return bool(np.any(self._shrunk(self._terms(chosen, self.solution(chosen)))))
 
     def held_out(self, chosen: Sequence[int], beside: Sequence[int] | None = None) -> Array:
         """Sums of squares of held-out rows by block and speed, (B, n_v), relative where they leave more than noise.

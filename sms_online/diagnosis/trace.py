@@ -308,6 +308,8 @@ class Tracing(Acceptance):
                 best != k
                 and k not in self._held
                 and not self._near(gains[k].gain, gains[best].gain)
+                # Beside parameters that are shrunk without it nobody else can be compared with it.
+                and not self.shrinks(others)
                 and self.improves(others, best)
             ):
                 chosen = [best if other == k else other for other in chosen]

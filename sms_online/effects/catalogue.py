@@ -287,9 +287,9 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     gauges = [strip for strip in strips if strip is not None]
     if entry.name == EncoderOffset.entry.name:
         return (*places(system, "angle"), *gauges)
-    if entry.name == ActuatorDelay.entry.name and len(joints := places(system, entry.at)) > 1:
+    if entry.name == ActuatorDelay.entry.name and len(drives := places(system, entry.at)) > 1:
         # The dead time of a controller, and that of one drive.
-        return ("joint_*", *joints)
+        return ("joint_*", *drives)
     if entry.name != SensorLag.entry.name:
         return places(system, entry.at)
     positions = places(system, "position")
