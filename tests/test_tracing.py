@@ -166,6 +166,26 @@ def test_stiction_is_found_beside_columns_that_fit_it_better(ripples: bool) -> N
     assert steps(0.6) == ([[1]] if ripples else [[0], [0, 2]])
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_weak_torque_does_not_shrink_parameters(seed: int) -> None:
+    """A torque of which most is unknown gives the scale alone: without the spring's law all else would vanish."""
+    rng = np.random.default_rng(seed)
+    x, y, u, v, rubbing, unknown, error = rng.standard_normal((7, WINDOWS))
+    true = np.array([1.0, 1.0])
+    Y = np.stack((50.0 * np.stack((x, y), axis=1), 600.0 * np.stack((u, -u - 0.3 * v), axis=1)), axis=1)
+    b = np.zeros((WINDOWS, SPEEDS))
+    b[:, 0] = Y[:, 0] @ true + 300.0 * unknown + 200.0 * rubbing
+    friction, spring = _candidate("presliding_friction", rubbing), _candidate("cubic_stiffness", np.zeros(WINDOWS))
+    spring.columns[:, 1, 0] = (error - Y[:, 1] @ true) / 300.0
+    rows = made_up_rows(Y, b)
+    rows.weights = true
+    nowhere = Sticking(np.zeros(WINDOWS, dtype=np.bool_), 0.0, 0.0)
+    tracing = Tracing(rows, [spring, friction], FOLDS, laws=nowhere)
+    found = tracing.run(lambda chosen, k: None)
+    assert sorted(found) == [0, 1]
+    np.testing.assert_allclose(tracing.solution(found)[:2], true, rtol=0.15)
+
+
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
 def test_a_replaced_effect_returns_for_what_the_other_leaves(times: float) -> None:
     rng = np.random.default_rng(3)

@@ -238,7 +238,8 @@ class CandidateRows(CandidateFits):
             beyond = sized > LARGEST_RATIO
         lacking = np.maximum(0.0, (ratio - 1.0) * np.mean(self.std**2, axis=0))
         self._homogeneous = beyond & self._scale.homogeneous
-        self._scale.free(beyond)
+        # Beside torques that leave more than noise their scale is as weak, and that of their noise draws it.
+        self._scale.free(self._scale.homogeneous if beyond.any() else beyond)
         self._usual = self._terms([], solution)
         # Rows that are beyond it by their size may leave less than it with parameters that are too small.
         return np.where(beyond, np.maximum(0.0, ratio - 1.0), 0.0), np.where(beyond, lacking, 0.0)

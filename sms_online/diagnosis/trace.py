@@ -192,7 +192,7 @@ class Tracing(Acceptance):
         """
         self.reweight(chosen)
         self._take(chosen)
-        while gone := [k for k in chosen if self._taken[k] <= self._least(k)]:
+        while gone := [k for k in chosen if self._taken[k] <= self._least(k) and not self._holds_scale(k, chosen)]:
             self._refused |= {self.candidates[k].key for k in gone}
             chosen = [k for k in chosen if k not in gone]
             self.reweight(chosen)
@@ -297,6 +297,8 @@ class Tracing(Acceptance):
         """
         last = chosen[-1]
         for k in list(chosen):
+            if self._holds_scale(k, chosen):
+                continue
             others = [other for other in chosen if other != k]
             gains = self.gains(others)
             # What refines a law is a step of its own, and in place of no other effect.
@@ -308,12 +310,15 @@ class Tracing(Acceptance):
                 best != k
                 and k not in self._held
                 and not self._near(gains[k].gain, gains[best].gain)
-                # Beside parameters that are shrunk without it nobody else can be compared with it.
-                and not self.shrinks(others)
                 and self.improves(others, best)
             ):
                 chosen = [best if other == k else other for other in chosen]
         return chosen
+
+    def _holds_scale(self, k: int, chosen: Sequence[int]) -> bool:
+        """Whether a fit without one of those chosen shrinks the parameters: then nothing can be compared with it."""
+        others = [other for other in chosen if other != k]
+        return self.shrinks(others) and not self.shrinks(chosen)
 
     def _simple(self, j: int, k: int) -> bool:
         """Whether a candidate may take the place of another: no refinement of a law, and a curve that of itself."""
