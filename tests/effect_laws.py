@@ -30,7 +30,7 @@ class Motion:
         self.z = rng.normal(size=(STATES, model.n_states))
         self.inputs = Inputs(self.tau, self.z)
         self.delta = self.x[:, M_1] - self.x[:, Q_1]
-        self.rate = self.v[:, M_1]
+        self.rate, self.link_rate = self.v[:, M_1], self.v[:, Q_1]
         self.theta_m = self.x[:, M_1]
         self.zero = np.zeros(STATES)
 
@@ -57,6 +57,8 @@ LAWS: dict[str, Law] = {
     "presliding_friction@joint_1:torque=0.4,width=0.02": lambda s: {M_1: -0.4 * s.z[:, 0] / 0.02},
     "load_friction@joint_1:ratio=0.03": lambda s: {M_1: -0.03 * np.abs(K * s.delta) * np.sign(s.rate)},
     "direction_friction@joint_1:plus=0.4,minus=0.7": lambda s: {M_1: -np.where(s.rate > 0.0, 0.4, 0.7) * s.rate},
+    "bearing_viscous_friction@joint_1:damping=0.4": lambda s: {Q_1: -0.4 * s.link_rate},
+    "bearing_coulomb_friction@joint_1:torque=0.4": lambda s: {Q_1: -0.4 * np.sign(s.link_rate)},
     "torsional_hysteresis@joint_1:torque=0.4,width=0.02": lambda s: spring(-0.4 * s.z[:, 0] / 0.02),
     "cubic_stiffness@joint_1:stiffness=70": lambda s: spring(-70 * s.delta * s.delta**2),
     # What is left of the spring beyond the gap, less the spring itself.
@@ -92,6 +94,8 @@ FORCES = (
     "presliding_friction@joint_1:torque=1,width=0.005",
     "load_friction@joint_1:ratio=0.02",
     "direction_friction@joint_1:plus=1,minus=0.5",
+    "bearing_viscous_friction@joint_2:damping=2",
+    "bearing_coulomb_friction@joint_1:torque=1",
     "torsional_hysteresis@joint_1:torque=5,width=0.01",
     "cubic_stiffness@joint_2:stiffness=2000",
     "backlash@joint_1:gap=0.002",

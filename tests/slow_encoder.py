@@ -48,7 +48,7 @@ def bench(factor: float = 1.0) -> System:
 
 
 @cache
-def _motion(coulomb: float) -> tuple[Array, Array]:
+def _motion(coulomb: float, bearing: float) -> tuple[Array, Array]:
     def reference(t: float | Array) -> Array:
         return np.asarray(0.6 * np.sin(0.8 * np.pi * t) + 0.25 * np.sin(3.4 * np.pi * t + 1.0))
 
@@ -59,19 +59,28 @@ def _motion(coulomb: float) -> tuple[Array, Array]:
         theta, q, rate, link_rate = y
         spring = K * (theta - q) + B * (rate - link_rate)
         rubbing = F * rate + coulomb * np.tanh(rate / 0.02)
-        return [rate, link_rate, (torque(t, theta, rate) - spring - rubbing) / I_M, spring / I_L]
+        loaded = spring - bearing * np.tanh(link_rate / 0.02)
+        return [rate, link_rate, (torque(t, theta, rate) - spring - rubbing) / I_M, loaded / I_L]
 
     t = np.arange(round(DURATION * RATE)) / RATE
     y = solve_ivp(change, (0.0, DURATION), np.zeros(4), t_eval=t, rtol=1e-9, atol=1e-11, method="LSODA").y
     return t, np.stack((torque(t, y[0], y[2]) / GEAR, y[0], y[1]), axis=1)
 
 
-def session(corner: float | None, coulomb: float = 0.0, once: float = 0.0, seed: int = 0, wander: float = 0.0) -> Block:
+def session(
+    corner: float | None,
+    coulomb: float = 0.0,
+    once: float = 0.0,
+    seed: int = 0,
+    wander: float = 0.0,
+    bearing: float = 0.0,
+) -> Block:
     """Samples; corner: Hz, of the low-pass behind which the link encoder is read; once: its error once per turn, rad.
 
-    coulomb: friction, N m. wander: 1σ of the torque's gain, at random and correlated over a second.
+    coulomb, bearing: friction of the motor, and of the link behind the spring, N m. wander: 1σ of the torque's gain,
+    at random and correlated over a second.
     """
-    t, exact = _motion(coulomb)
+    t, exact = _motion(coulomb, bearing)
     values = exact.copy()
     if wander:
         fade, before = np.exp(-1.0 / RATE), round(10.0 * RATE)

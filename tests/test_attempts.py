@@ -105,6 +105,18 @@ def test_a_described_lag_leaves_the_spring_beside_a_torque_that_wanders() -> Non
     assert abs(spring.value - K) < 3.0 * spring.std < 0.03 * K
 
 
+@pytest.mark.slow
+def test_friction_behind_the_spring_is_told_from_the_motor_s() -> None:
+    """Both undeclared. The simulation rounds the motor's off below 0.02 rad/s, as presliding does."""
+    found = sms.diagnose(bench(), session(None, COULOMB, bearing=2.0 * COULOMB))
+    bearing, motor = sorted(found.effects, key=lambda effect: effect.name)
+    assert bearing.name == "bearing_coulomb_friction"
+    assert bearing.coefficients["torque"].value == pytest.approx(2.0 * COULOMB, rel=0.05)
+    assert motor.name in ("coulomb_friction", "presliding_friction")
+    assert motor.coefficients["torque"].value == pytest.approx(COULOMB, rel=0.05)
+    assert found.after.parameters["joint_1.stiffness"].value == pytest.approx(K, rel=0.005)
+
+
 def test_what_an_event_added_to_a_session_is_no_part_of_the_description() -> None:
     """Coulomb friction begins after 6 s, and an event adds it to the session's model; a lag is then tried."""
     block = axis_block(lambda q, rate: np.sign(rate), begin=6.0)

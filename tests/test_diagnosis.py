@@ -79,6 +79,8 @@ def test_a_session_that_the_model_explains_is_clean() -> None:
     [
         # The sign of a noisy rate at standstill takes some of the friction away.
         ("coulomb_friction@joint_2:torque=1", 0.05),
+        ("bearing_coulomb_friction@joint_2:torque=1", 0.05),
+        ("bearing_viscous_friction@joint_1:damping=2", 0.01),
         ("cubic_stiffness@joint_1:stiffness=300", 0.01),
         # Without it the base's rows are best explained by an arm of no mass, whose rows have no noise.
         ("air_drag@base:damping=150", 0.01),

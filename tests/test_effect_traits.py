@@ -66,10 +66,11 @@ def test_a_force_reverses_where_it_follows_its_rate_s_sign() -> None:
             continue
         x, v = np.full((2, layout.n_x), 0.1), np.zeros((2, layout.n_v))
         x[:, layout.theta_m[0] + layout.offset] = 0.2
-        v[:, layout.theta_m[0]] = 0.01, -0.01
-        up, down = effect.force(layout, x, v, None)[:, layout.theta_m[0]]
-        v[:, layout.theta_m[0]] = 0.02, 0.0
-        forwards, rest = effect.force(layout, x, v, None)[:, layout.theta_m[0]]
+        axis = effect.axis(layout)
+        v[:, axis] = 0.01, -0.01
+        up, down = effect.force(layout, x, v, None)[:, axis]
+        v[:, axis] = 0.02, 0.0
+        forwards, rest = effect.force(layout, x, v, None)[:, axis]
         odd_and_smooth = np.allclose(forwards - rest, 2.0 * (up - rest), rtol=0.1) and np.allclose(
             up + down, 2.0 * rest
         )

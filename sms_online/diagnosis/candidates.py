@@ -54,8 +54,8 @@ class CandidateColumns:
         self._noisy: list[CandidateColumns] = []
         self._made: dict[tuple[object, ...], Model] = {}
         self._forms = QuadraticForms()
-        self._held: dict[str, SessionStandstill] = {}
-        self._turned: dict[str, Reversals] = {}
+        self._held: dict[int, SessionStandstill] = {}
+        self._turned: dict[int, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
 
     def within(self, weak: WeakWindows, resting: bool = False) -> CandidateColumns:
@@ -199,13 +199,13 @@ class CandidateColumns:
 
             if not force.reversing:
                 return None, along(motion.v)
-            G = self._reversals(force.where).mean(along, motion)
+            G = self._reversals(force.axis(model.layout)).mean(along, motion)
             if force.dry and not self._resting:
                 # Stiction is no matter of the law but just before breakaway.
-                held = self._standstill(force.where)
+                held = self._standstill(force.axis(model.layout))
                 still, leaving = (each(motion.segment, motion.samples) for each in (held.at, held.leaving))
                 v = motion.v.copy()
-                v[:, held.motor] = leaving * MOVING_OFF
+                v[:, held.axis] = leaving * MOVING_OFF
                 G = np.where(still[:, None, None], along(v), G)
             return None, G
 
@@ -258,7 +258,7 @@ class CandidateColumns:
         Where the sign changes, at a standstill, and by what the filter rounds off of the rate.
         """
         force = model.effects[-1]
-        turned, held = self._reversals(force.where), self._standstill(force.where)
+        turned, held = self._reversals(force.axis(model.layout)), self._standstill(force.axis(model.layout))
         leaving_for = round(LEAVING * self.system.sample_rate)
 
         def squares(motion: SeenMotion) -> Array:
@@ -271,7 +271,7 @@ class CandidateColumns:
             if not force.dry:
                 return jumps
             v = motion.v.copy()
-            v[:, held.motor] = MOVING_OFF
+            v[:, held.axis] = MOVING_OFF
             still, leaving = (each(motion.segment, motion.samples)[:, None] for each in (held.at, held.leaving))
             times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.alike)
             return np.where(still, times * along(v) ** 2, jumps)
@@ -315,28 +315,26 @@ class CandidateColumns:
 
     def at_rest(self, candidate: Candidate) -> float:
         """Share of the session in which the axis of a law of dry friction is at rest."""
-        return self._standstill(candidate.effect.where).share
+        model = self._model(candidate.effect)
+        return self._standstill(model.effects[-1].axis(model.layout)).share
 
-    def _standstill(self, where: str) -> SessionStandstill:
-        """Standstill of a joint's motor."""
-        if where not in self._held:
-            rows, joint = self.rows, index_of(where)
-            noise = self._noise_of(joint)
-            self._held[where] = SessionStandstill(rows.sensing, rows.segments, joint, noise, self.system.sample_rate)
-        return self._held[where]
+    def _standstill(self, axis: int) -> SessionStandstill:
+        """Standstill of an axis, by the number of its speed."""
+        if axis not in self._held:
+            rows, rate = self.rows, self.system.sample_rate
+            self._held[axis] = SessionStandstill(rows.sensing, rows.segments, axis, self._noise_of(axis), rate)
+        return self._held[axis]
 
-    def _reversals(self, where: str) -> Reversals:
-        """Reversals of a joint's motor, in the windows' own samples."""
-        if where not in self._turned:
-            rows, joint = self.rows, index_of(where)
-            parts = self._noise_of(joint), self.system.sample_rate, self._standstill(where)
-            self._turned[where] = Reversals(rows.sensing, self._weak.segments, joint, *parts)
-        return self._turned[where]
+    def _reversals(self, axis: int) -> Reversals:
+        """Reversals of an axis, in the windows' own samples."""
+        if axis not in self._turned:
+            parts = self._noise_of(axis), self.system.sample_rate, self._standstill(axis)
+            self._turned[axis] = Reversals(self.rows.sensing, self._weak.segments, *parts)
+        return self._turned[axis]
 
-    def _noise_of(self, joint: int) -> float:
-        """σ of the position of a joint's motor, rad."""
-        layout = self.rows.model.layout
-        return float(position(layout, self.rows.noise.coordinates[None], layout.theta_m[joint])[0])
+    def _noise_of(self, axis: int) -> float:
+        """σ of the position of an axis, rad."""
+        return float(position(self.rows.model.layout, self.rows.noise.coordinates[None], axis)[0])
 
     def _declaring(self, effect: Effect) -> System:
         """The system with one more effect."""

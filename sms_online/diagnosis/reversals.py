@@ -1,6 +1,6 @@
-"""The rate of a motor for forces that jump with its sign, and how well its reversals are located.
+"""The rate of an axis for forces that jump with its sign, and how well its reversals are located.
 
-At a reversal dry friction bends the motor's rate. A filter as wide as the smooth motion allows rounds off the bend, and
+At a reversal dry friction bends that rate. A filter as wide as the smooth motion allows rounds off the bend, and
 moves the zero of the rate by milliseconds, at every reversal to the same side. So the rate comes through a filter as
 narrow as its noise allows. The error that remains follows from that noise, and from a wider filter. An integral over
 samples resolves a jump to half a sample only, so forces are averaged over instants between them.
@@ -41,18 +41,18 @@ def _gains(M: int) -> tuple[float, float]:
 
 
 class Reversals:
-    """Rates of one motor.
+    """Rates of one axis.
 
-    joint: of the motor, by number from 0. noise: σ of its position, rad. standstill: of the same.
+    noise: σ of its position, rad. standstill: where it is at rest.
     """
 
     def __init__(
-        self, sensing: Sensing, segments: Sequence[Segment], joint: int, noise: float, sample_rate: float,
+        self, sensing: Sensing, segments: Sequence[Segment], noise: float, sample_rate: float,
         standstill: SessionStandstill,
     ) -> None:  # fmt: skip
         layout = sensing.model.layout
-        self._motor = layout.theta_m[joint]
-        self._angles = [position(layout, sensing.coordinates(each.values), self._motor)[:, None] for each in segments]
+        self._axis = standstill.axis
+        self._angles = [position(layout, sensing.coordinates(each.values), self._axis)[:, None] for each in segments]
         self._noise, self._rate, self._standstill = noise, sample_rate, standstill
         self._known: dict[int, list[Array]] = {}
 
@@ -60,7 +60,7 @@ class Reversals:
     def _half_width(self) -> int:
         """Half width of the filter that locates all changes of sign best, which are the more the narrower it is.
 
-        Where the motor is at rest noise alone changes it.
+        Where the axis is at rest noise alone changes it.
         """
         # Twice the width has to lie within the segments.
         shortest = min(len(angle) for angle in self._angles)
@@ -74,7 +74,7 @@ class Reversals:
         return min(widths, key=off)
 
     def _rates(self, segment: int, M: int, at: NDArray[Any]) -> Array:
-        """θ̇_m (K,) at samples `at` (K,) of a segment, between whole ones too, rad/s."""
+        """Rates (K,) at samples `at` (K,) of a segment, between whole ones too, rad/s."""
         if M not in self._known:
             # All segments at once, for a search may see a hundred short ones.
             lengths = [len(angle) for angle in self._angles]
@@ -110,7 +110,7 @@ class Reversals:
         v = motion.v.copy()
         total: Array | float = 0.0
         for part in WITHIN:
-            v[:, self._motor] = self._rates(motion.segment, M, motion.samples + part)
+            v[:, self._axis] = self._rates(motion.segment, M, motion.samples + part)
             total = total + force(v)
         return np.asarray(total / len(WITHIN))
 
@@ -125,7 +125,7 @@ class Reversals:
 
         def at(speed: Array | float) -> Array:
             v = motion.v.copy()
-            v[:, self._motor] = speed
+            v[:, self._axis] = speed
             return force(v)
 
         slowest = BESIDE * STANDSTILL

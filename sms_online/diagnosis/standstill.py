@@ -1,4 +1,4 @@
-"""Where a motor is at rest in a whole session."""
+"""Where a motor, or a joint, is at rest in a whole session."""
 
 from __future__ import annotations
 
@@ -19,21 +19,20 @@ LEAVING = 0.025
 
 
 class SessionStandstill:
-    """Where one motor is at rest in a session.
+    """Where one axis is at rest in a session.
 
-    joint: of the motor, by number from 0. noise: σ of its position, rad. slow: the rate below which it is at rest,
-    rad/s.
+    axis: number of its speed. noise: σ of its position, rad. slow: the rate below which it is at rest, rad/s.
     """
 
     def __init__(
-        self, sensing: Sensing, segments: Sequence[Segment], joint: int, noise: float, sample_rate: float
+        self, sensing: Sensing, segments: Sequence[Segment], axis: int, noise: float, sample_rate: float
     ) -> None:
         layout = sensing.model.layout
-        self.motor = layout.theta_m[joint]
+        self.axis = axis
         self.slow = slowest(noise, rate_filter(sample_rate), sample_rate)
         self._still, self._leaving = [], []
         for segment in segments:
-            angle = position(layout, sensing.coordinates(segment.values), self.motor)
+            angle = position(layout, sensing.coordinates(segment.values), axis)
             still = Standstill(1, sample_rate)
             still.push(angle[:, None], np.array([noise]))
             self._still.append(still.at(np.arange(angle.size))[:, 0])

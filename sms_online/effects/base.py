@@ -202,6 +202,10 @@ class Force(ForceEffect):
             for quantity, (symbol, unit, nominal) in linear.items()
         )
 
+    def axis(self, layout: Layout) -> int:
+        """That of the joint's motor."""
+        return layout.theta_m[self.index - 1]
+
 
 def position(layout: Layout, x: Array, speed: int) -> Array:
     """Position (B,) whose rate is a speed beyond the base's."""

@@ -21,6 +21,8 @@ from sms_online.effects.coupled import CoupledFriction, CoupledInertia, GravityS
 from sms_online.effects.delay import LONGEST_DELAY, ActuatorDelay, SensorLag, SensorLatency, TorqueDelay
 from sms_online.effects.drive import Cogging, TorqueGain, TorqueOffset, TorqueRipple
 from sms_online.effects.friction import (
+    BearingCoulombFriction,
+    BearingViscousFriction,
     CoulombFriction,
     DirectionFriction,
     LoadFriction,
@@ -41,7 +43,7 @@ FORCES = (
     CoulombFriction, ViscousFriction, StribeckFriction, PreslidingFriction, LoadFriction, DirectionFriction,
     TorsionalHysteresis, CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping,
     ReactionWheel, ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
-    CoupledFriction, GravitySpring, LearnedForce,
+    CoupledFriction, GravitySpring, BearingViscousFriction, BearingCoulombFriction, LearnedForce,
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay, ActuatorDelay)
 INERTIAS = (TipPayload, CoupledInertia)

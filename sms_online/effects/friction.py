@@ -1,4 +1,4 @@
-"""Friction of a motor shaft against the stator, at the output side of the gear.
+"""Friction of a motor shaft against the stator, at the output side of the gear, and of the bearing behind the spring.
 
 Source of the laws: Armstrong-Hélouvry, Dupont, Canudas de Wit, Automatica 30 (1994) 1083; load-dependent friction of
 gears: Bittencourt, Gunnarsson, J. Dynamic Systems, Measurement and Control 134 (2012) 051013; friction with memory:
@@ -27,21 +27,21 @@ def sign(rate: Array) -> Array:
 
 
 class MotorSide(Force):
-    """A generalized force along θ_m of one joint."""
+    """A generalized force along the axis of one joint's motor, θ_m."""
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Force (B, coefficients) of one unit of each coefficient."""
         raise NotImplementedError
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """`along` on the row of θ_m."""
+        """`along` on the row of the axis."""
         f = np.zeros((*v.shape, len(self.parameters)))
-        f[:, layout.theta_m[self.index - 1]] = self.along(layout, x, v, inputs)
+        f[:, self.axis(layout)] = self.along(layout, x, v, inputs)
         return f
 
     def rate(self, layout: Layout, v: Array) -> Array:
-        """θ̇_m (B,)."""
-        return v[:, layout.theta_m[self.index - 1]]
+        """Rate of the axis (B,)."""
+        return v[:, self.axis(layout)]
 
 
 class ViscousFriction(MotorSide):
@@ -194,3 +194,51 @@ class DirectionFriction(MotorSide):
         """-θ̇_m forwards and backwards."""
         rate = self.rate(layout, v)
         return -np.stack((np.maximum(rate, 0.0), np.minimum(rate, 0.0)), axis=1)
+
+
+class LinkSide(MotorSide):
+    """A generalized force along q of one joint, between links that the joint's spring is in parallel to."""
+
+    def axis(self, layout: Layout) -> int:
+        """That of the joint behind its spring."""
+        return layout.q[self.index - 1]
+
+
+class BearingViscousFriction(LinkSide):
+    """f = -c q̇ on the link side of the spring, c `damping` in N m s/rad (N s/m on a prismatic joint).
+
+    Limitations: linear, as viscous friction on the motor side.
+    """
+
+    entry = Entry(
+        "bearing_viscous_friction", "force", "flexible joint", {"damping": "N m s/rad"},
+        "fast and slow motion with the load that the spring carries at both",
+    )  # fmt: skip
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"damping": (f"d_b{site.index}", "N m s/rad", given.get("damping", 0.0))})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-q̇."""
+        return -self.rate(layout, v)[:, None]
+
+
+class BearingCoulombFriction(LinkSide):
+    """f = -c sign(q̇) on the link side of the spring, c `torque` in N m (N on a prismatic joint).
+
+    The spring carries it, so that it deflects by c / k where the axis comes to rest.
+    Limitations: no stiction and no presliding, as Coulomb friction on the motor side.
+    """
+
+    entry = Entry(
+        "bearing_coulomb_friction", "force", "flexible joint", {"torque": "N m"},
+        "reversals under little load, slow and fast",
+        traits=Traits(course="dry"),
+    )  # fmt: skip
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"torque": (f"c_b{site.index}", "N m", given.get("torque", 0.0))})
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-sign(q̇)."""
+        return -sign(self.rate(layout, v))[:, None]

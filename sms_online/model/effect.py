@@ -35,7 +35,7 @@ class ForceEffect(Protocol):
 
     parameters: the linear coefficients as they enter π. shapes: shape constants. relative_to: names of the model's
     parameters that reported coefficients are divided by. n_states: number of internal states. smooth: whether it is as
-    smooth as the motion, which is thinned then. reversing: whether it jumps with the sign of its joint's motor's rate.
+    smooth as the motion, which is thinned then. reversing: whether it jumps with the sign of a rate of its joint.
     dry: whether at a standstill it is any value up to that of its law. needs_masses: whether its columns hold reference
     masses of the model. A joint's force and internal states depend on that joint's positions, rates and torque.
     """
@@ -59,6 +59,10 @@ class ForceEffect(Protocol):
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Columns f_j (B, n_v, coefficients): generalized force of one unit of each coefficient."""
+
+    def axis(self, layout: Layout) -> int:
+        """Number of the speed whose sign the force follows; ValueError where it is neither reversing nor dry."""
+        raise ValueError(f"{self.key} follows the sign of no rate")
 
     def power(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Power (B, coefficients) that one unit of each coefficient takes out, W: -f · v."""

@@ -119,7 +119,7 @@ class MomentumBalance(Stage):
         self._physical = np.array(base.independent)[self.columns]
         self.rough = RoughForces(model)
         self._rough = np.flatnonzero(np.isin(self._physical, self.rough.columns))
-        self._motors = np.unique(self.rough.motors) + model.layout.offset  # coordinates of those with dry friction
+        self._dry = np.unique(self.rough.axes) + model.layout.offset  # coordinates along which friction is dry
         self._widths = half_widths(self.width)
         # Samples before and after a window that its filter needs.
         self.lead = self._widths[-1]
@@ -150,7 +150,7 @@ class MomentumBalance(Stage):
         layout = self.model.layout
         columns = COPIES * (layout.n_x + self.model.n_signals)
         self.state = MomentumBalanceState(np.empty((0, columns)))
-        self._standstill = Standstill(self._motors.size, self.sample_rate)
+        self._standstill = Standstill(self._dry.size, self.sample_rate)
 
     def push(
         self, index: NDArray[np.int64], copies: list[Array], sigma: Array, lateness: Array | None = None
@@ -165,8 +165,8 @@ class MomentumBalance(Stage):
             self.state.skip = -(int(index[0]) + self.lead) % self.hop if self._prompt else 0
         skipped, self.state.skip = min(self.state.skip, index.size), max(0, self.state.skip - index.size)
         self.state.samples = np.concatenate((self.state.samples, np.concatenate(copies, axis=1)[skipped:]))
-        if self._motors.size:
-            self._standstill.push(copies[0][skipped:, self._motors], sigma[self._motors])
+        if self._dry.size:
+            self._standstill.push(copies[0][skipped:, self._dry], sigma[self._dry])
         grid = int(index[-1]) - (self.state.first + self.state.samples.shape[0] - 1)
         chosen: list[tuple[int, int]] = []  # first sample and half width of each window
         while self.state.window + self.width + self.lead + self.margin < self.state.first + self.state.samples.shape[0]:
@@ -276,7 +276,7 @@ class MomentumBalance(Stage):
         parts = np.cumsum([COPIES * (self._rough.size + self.model.layout.n_v), 2 * self.rough.rows.size])
         entries = int(parts[-1]) + self.rough.dry.size
         kept = self._sampling.kept(self.state.dense, half_width, 1, windows[0], entries)
-        motor_of = np.searchsorted(self._motors, self.rough.motors + self.model.layout.offset)
+        axis_of = np.searchsorted(self._dry, self.rough.axes + self.model.layout.offset)
         # Entries of columns and slopes by laws of dry friction: at a standstill their sign is noise's, not friction's.
         by_law = [
             places[:, None] == self.rough.dry for places in (self._physical[self._rough], self.rough.coefficients)
@@ -285,7 +285,7 @@ class MomentumBalance(Stage):
         seen = self._sampling.seen(kept, half_width, windows, self._rough_columns)
         for window, row, values in zip(windows, rows, seen, strict=True):
             columns, slopes, breaking = np.split(values, parts, axis=1)
-            still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)[:, motor_of]
+            still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)[:, axis_of]
             moving, both = (~(still @ law.T) for law in by_law)
             columns = columns.reshape(len(columns), COPIES, -1).copy()
             columns[..., : self._rough.size] *= moving[:, None]

@@ -35,8 +35,8 @@ class RoughForces:
 
     columns (c,): their places in π. rows, coefficients, coordinates (E,): of the entries of `slopes`: generalized
     speed whose row a force is in, place in π of its coefficient, speed along which a position or rate changes; of
-    joints' forces, which depend on that joint's positions and rates. motors, dry (D,): of laws of dry friction, speed
-    of the motor, place in π of the coefficient.
+    joints' forces, which depend on that joint's positions and rates. axes, dry (D,): of laws of dry friction, speed
+    whose sign they follow, place in π of the coefficient.
     """
 
     def __init__(self, model: Model) -> None:
@@ -53,13 +53,9 @@ class RoughForces:
             entry for k, speeds in self._joints.items() for entry in product(speeds, speeds, self._places(k).tolist())
         ]
         self.coordinates, self.rows, self.coefficients = np.array(entries, dtype=np.int64).reshape(-1, 3).T
-        self._dry = [(k, self._motor(k)) for k in rough if model.effects[k].dry]
-        dry = [(motor, place) for k, motor in self._dry for place in self._places(k).tolist()]
-        self.motors, self.dry = np.array(dry, dtype=np.int64).reshape(-1, 2).T
-
-    def _motor(self, k: int) -> int:
-        (joint,) = joints_of(self._model.effects[k].where)
-        return self._model.layout.theta_m[joint]
+        self._dry = [(k, model.effects[k].axis(layout)) for k in rough if model.effects[k].dry]
+        dry = [(axis, place) for k, axis in self._dry for place in self._places(k).tolist()]
+        self.axes, self.dry = np.array(dry, dtype=np.int64).reshape(-1, 2).T
 
     def _places(self, k: int) -> NDArray[np.int64]:
         columns = self._model.effect_slices[k]
@@ -111,11 +107,11 @@ class RoughForces:
         """What breaks an axis of dry friction loose (K, D): force of one unit of each coefficient as it moves off."""
         out = np.empty((len(x), self.dry.size))
         acting = list(self._model.acting(self._model.inputs(signals)))
-        for k, motor in self._dry:
+        for k, axis in self._dry:
             effect, _, own = acting[k]
             slow = v.copy()
-            slow[:, motor] = MOVING_OFF
-            out[:, np.isin(self.dry, self._places(k))] = effect.force(self._model.layout, x, slow, own)[:, motor]
+            slow[:, axis] = MOVING_OFF
+            out[:, np.isin(self.dry, self._places(k))] = effect.force(self._model.layout, x, slow, own)[:, axis]
         return out
 
     def at_rest(self, rest: Array, pi: Array) -> Array:
@@ -124,10 +120,10 @@ class RoughForces:
         (W, INSTANTS, n_v), of parameters π (n_pi,); no half hops for a model without dry friction. rest
         (W, INSTANTS, D): see `stiction_std`.
         """
-        by_motor = np.eye(self._model.layout.n_v)[self.motors]
+        by_axis = np.eye(self._model.layout.n_v)[self.axes]
         if not self.dry.size:
-            return np.empty((len(rest), 0, by_motor.shape[1]))
-        return np.asarray(np.abs((rest * pi[self.dry]) @ by_motor))
+            return np.empty((len(rest), 0, by_axis.shape[1]))
+        return np.asarray(np.abs((rest * pi[self.dry]) @ by_axis))
 
     def without(self, pi: Array) -> Array:
         """π (n_pi,) without the forces that `slopes` covers."""
