@@ -18,6 +18,10 @@ def smoother_warnings(now: Statistics) -> list[str]:
         asked = setup.system.balance == "smoother"
         return ["no smoother: it cannot correct the declared effects on channels"] if asked else []
     out = [f"the smoother left out {failure}" for failure in smoother.failures]
+    if smoother.noisier:
+        names, most = [name for name, _ in smoother.noisier], max(times for _, times in smoother.noisier)
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        out.append(f"{', '.join(names[:NAMED])}{more}: up to {most:.2g} × their stated noise, which is what counts")
     missing = ", ".join(setup.sensing.missing)
     if now.method != "smoother":
         bent = "links are taken to bend quasi-statically: estimates are off by several percent"

@@ -21,6 +21,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_sim.plant import Plant
 from sms_sim.simulate import sampled_blocks, simulate
 from tests.camera_rig import bound_of, marked_bench, seen_by_cameras
+from tests.evaluated import results_document
 from tests.model_systems import random_states
 from tests.one_link import one_link
 from tests.sessions_of import normalised, session_of
@@ -113,6 +114,44 @@ def test_a_static_shape_is_found_from_points_to_a_hundredth() -> None:
     values = plant.channel_values(np.zeros((1, 2)), x)
     found = sensing.coordinates(values[:, [plant.channels.index(name) for name in sensing.channels]])
     assert_allclose(found, x, atol=0.01 * np.abs(x[0, 7:]).max())
+
+
+def test_a_shape_far_from_straight_is_found_from_points() -> None:
+    """A link that bends by a third of its length, and twists: steps of Gauss and Newton alone run away."""
+    system = load_system("spatial-two-link")
+    at = ((0.35, 0.0, 0.05), (0.75, 0.06, -0.04), (1.15, -0.05, 0.02))
+    links = [pointed(k, *at).model_copy(update={"kinematics": "exact"}) for k in system.links]
+    plant = Plant(system.model_copy(update={"links": tuple(links)}))
+    layout, sensing = plant.model.layout, Sensing(plant.model, plant.channels, "test")
+    columns = [plant.channels.index(name) for name in sensing.channels]
+    for size in (0.5, 0.85):
+        x = np.zeros((1, layout.n_x))
+        x[0, 6] = 1.0  # the last Euler parameter
+        q_f = layout.q_f[0]
+        x[0, q_f] = size * np.random.default_rng(4).uniform(-1.0, 1.0, q_f.stop - q_f.start)
+        values = plant.channel_values(np.zeros((1, plant.model.n_inputs)), x)[:, columns]
+        found = sensing.coordinates(values)
+        again = plant.channel_values(np.zeros((1, plant.model.n_inputs)), found)[:, columns]
+        assert_allclose(again, values, atol=0.01)
+
+
+@pytest.mark.slow
+def test_cameras_noisier_than_stated_are_taken_as_they_are() -> None:
+    """Twice the stated noise: no fit agrees with that, and the estimate would be that of links bent at rest."""
+    system, noise = marked_bench(), np.random.default_rng(5)
+    blocks = list(sampled_blocks(simulate(system), None, 0))
+    columns = [k for k, name in enumerate(blocks[0].channels) if ".marker_" in name]
+    (sigma,) = {sensor.noise for sensor in system.sensors if "marker" in sensor.channels[0]}
+    for block in blocks:
+        block.values[:, columns] += np.sqrt(3.0) * sigma * noise.standard_normal((len(block.t), len(columns)))
+    estimator = session_of(system, blocks)
+    assert estimator.by_smoother
+    assert np.all(np.abs(normalised(estimator)) < 4.0)
+    assert estimator.smoother is not None
+    times = dict(estimator.smoother.known.noisier)
+    assert set(times) == {blocks[0].channels[k] for k in columns}
+    assert_allclose(list(times.values()), 2.0, rtol=0.15)
+    assert any("their stated noise" in warning for warning in results_document(estimator)["warnings"])
 
 
 @pytest.mark.slow

@@ -18,6 +18,10 @@ USUAL_DEFLECTION = 0.03
 # What a link's frame is off by, made of readings of base and joints as it is, m and rad, as a multiple of the points'
 # noise. With none a link behind noisy frames comes out bent; a hundred times as much lets it hang from a wrong slope.
 FRAME_NOISE = 3.0
+# Steps to a shape at most, more than NEWTON_STEPS where it is far from straight, and halvings of one of them. Rounding
+# may raise the cost by the share SAME. A step that lowers twice the negative log likelihood by less than SETTLED is the
+# last.
+MOST_STEPS, MOST_HALVINGS, SAME, SETTLED = 40, 8, 1e-9, 1e-3
 
 
 class SensedShape:
@@ -81,16 +85,45 @@ class PointedShape:
         seen[..., axes] = readings.reshape(B, -1, len(axes))
         seen[..., axes] -= origin[:, None, axes]
         seen = (seen @ rotation)[..., axes].reshape(B, -1)
-        z = np.zeros((B, len(self._precision)))
-        for _ in range(NEWTON_STEPS):
-            local = self._points.local(z[:, : self._n_f])
-            moved = np.broadcast_to(np.eye(3)[:, axes], (*local.position.shape, len(axes)))
-            turned = -so3.skew(local.position)[..., self._turning]
-            J = np.concatenate((local.by_elastic, moved, turned), axis=3)[:, :, axes].reshape(B, -1, z.shape[1])
-            frame = (J[..., self._n_f :] @ z[:, self._n_f :, None])[..., 0]
-            off = seen - local.position[..., axes].reshape(B, -1) - frame
-            weighted = np.where(np.isnan(off)[..., None], 0.0, J) / self._sigma**2
-            right = (weighted.swapaxes(1, 2) @ np.nan_to_num(off)[..., None])[..., 0] - z @ self._precision
-            z += np.linalg.solve(weighted.swapaxes(1, 2) @ J + self._precision, right[..., None])[..., 0]
+        z = self._nearest(seen)
         z[np.isnan(seen).all(axis=1)] = np.nan
         return z[:, : self._n_f]
+
+    def _nearest(self, seen: Array) -> Array:
+        """Elastic coordinates and displacement of the frame (B, n_f + d) for points in {i} (B, n · axes), by
+        Gauss-Newton steps that are halved where they lead away."""
+        z = np.zeros((len(seen), len(self._precision)))
+        step, cost, moving = z.copy(), np.full(len(seen), np.inf), np.arange(len(seen))
+        for k in range(MOST_STEPS):
+            J, off, now = self._about(z[moving], seen[moving])
+            for share in (*[0.5] * MOST_HALVINGS, 0.0):  # in the end none of it
+                worse = ~(now <= (1.0 + SAME) * cost[moving])
+                if not worse.any():
+                    break
+                back = moving[worse]
+                z[back] -= (1.0 - share) * step[back]
+                step[back] *= share
+                J[worse], off[worse], now[worse] = self._about(z[back], seen[back])
+            cost[moving] = now
+            weighted = np.where(np.isnan(off)[..., None], 0.0, J) / self._sigma**2
+            right = (weighted.swapaxes(1, 2) @ np.nan_to_num(off)[..., None])[..., 0] - z[moving] @ self._precision
+            ahead = np.linalg.solve(weighted.swapaxes(1, 2) @ J + self._precision, right[..., None])[..., 0]
+            step[moving] = ahead
+            z[moving] += ahead
+            if k + 1 >= NEWTON_STEPS:
+                moving = moving[np.sum(ahead * right, axis=1) > SETTLED]
+                if not moving.size:
+                    return z
+        z[moving] -= step[moving]  # which nothing has tried
+        return z
+
+    def _about(self, z: Array, seen: Array) -> tuple[Array, Array, Array]:
+        """Derivatives (K, n · axes, n_f + d) of points at z (K, n_f + d), what these are off by, and the cost (K,)."""
+        local, axes = self._points.local(z[:, : self._n_f]), self._axes
+        moved = np.broadcast_to(np.eye(3)[:, axes], (*local.position.shape, len(axes)))
+        turned = -so3.skew(local.position)[..., self._turning]
+        J = np.concatenate((local.by_elastic, moved, turned), axis=3)[:, :, axes].reshape(len(z), -1, z.shape[1])
+        frame = (J[..., self._n_f :] @ z[:, self._n_f :, None])[..., 0]
+        off = seen - local.position[..., axes].reshape(len(z), -1) - frame
+        cost = np.nansum(off**2, axis=1) / self._sigma**2 + np.sum((z @ self._precision) * z, axis=1)
+        return J, off, cost

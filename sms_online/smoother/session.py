@@ -35,6 +35,8 @@ LEAST_SPAN = 0.5
 HOLE, FILL = 0.015, 0.01
 # Samples within this time of an instant, s, say what a channel reads then.
 NEARBY = 0.05
+# Readings that scatter by this multiple of their stated noise hold more than that: a tenth more and no fit is taken.
+NOISIER = 1.05
 # No channel is better than this share of its largest reading: the collocation errs by as much.
 FINEST = 1e-6
 
@@ -44,7 +46,8 @@ class SmootherStatistics(NamedTuple):
 
     failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square: of the
     last span, see `SpanFit`; level: the largest of all. factor (n + 1, n + 1): square-root information about beta (n,).
-    last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque.
+    last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque. noisier:
+    channels whose samples show more noise than is stated, and how many times as much, where no fit is taken otherwise.
     """
 
     failures: tuple[str, ...]
@@ -58,6 +61,7 @@ class SmootherStatistics(NamedTuple):
     last_step: float
     end: float
     lost: int
+    noisier: tuple[tuple[str, float], ...] = ()
 
     def estimate(self, prior: Prior | None) -> Estimate:
         """The base parameters, with what is known of them beforehand; only after the first span."""
@@ -226,6 +230,9 @@ class Smoother(Stage):
             known = triangular_factor(prior_factor(self.prior, self._base.n), past.factor)
             fit = smoother.fit(span, beta, known, past.last_step if past.spans else None, now.ending)
         except DivergedError as error:
+            if self._noisier(now.t[inside], now.values[inside]):
+                self._fit(count, first_fit)
+                return
             failures = (*now.known.failures, f"{begin:.6g} … {end:.6g} s: {error}")
             now.known, now.ending = now.known._replace(failures=failures), None
             return
@@ -282,7 +289,21 @@ class Smoother(Stage):
             last_step=fit.step,
             end=end,
             lost=self._synchroniser.counters.lost_samples,
+            noisier=past.noisier,
         )
+
+    def _noisier(self, t: Array, values: Array) -> bool:
+        """Whether samples (M, channels) at t (M,) show more noise than is taken so far; then that is taken."""
+        stated, times = stated_noise(self._model.system, self.channels), dict(self.known.noisier)
+        found = dict(times)
+        for k in np.flatnonzero(np.isfinite(stated)):
+            name, own = self.channels[k], np.flatnonzero(np.isfinite(values[:, k]))[-SAMPLES:]
+            if own.size >= FEWEST_SAMPLES:
+                shown = float(noise_std(values[own, k][:, None], t[own])[0] / stated[k])
+                if shown > NOISIER * times.get(name, 1.0):
+                    found[name] = shown
+        self.state.known = self.known._replace(noisier=tuple(found.items()))
+        return found != times
 
     def _realisable(self, estimate: Estimate) -> Array:
         """β (n,) of the physically consistent parameters nearest to an estimate."""
@@ -295,7 +316,8 @@ class Smoother(Stage):
 
     def _with_noise(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array, Array]:
         """Samples at t, their noise (C,), NaN where nothing is known of it, and the torques' density (joints,)."""
-        sigma = stated_noise(self._model.system, self.channels)
+        times = dict(self.known.noisier)
+        sigma = stated_noise(self._model.system, self.channels) * [times.get(name, 1.0) for name in self.channels]
         if self.state.ending is not None:
             # A short span has too few samples of a slow channel.
             sigma = np.where(np.isnan(sigma), self.state.sigma, sigma)
