@@ -19,9 +19,9 @@ USUAL_DEFLECTION = 0.03
 # noise. With none a link behind noisy frames comes out bent; a hundred times as much lets it hang from a wrong slope.
 FRAME_NOISE = 3.0
 # Steps to a shape at most, more than NEWTON_STEPS where it is far from straight, and halvings of one of them. Rounding
-# may raise the cost by the share SAME. A step that lowers twice the negative log likelihood by less than SETTLED is the
-# last.
-MOST_STEPS, MOST_HALVINGS, SAME, SETTLED = 40, 8, 1e-9, 1e-3
+# may raise the cost by the share SAME. A step that lowers twice the negative log likelihood by less than CONVERGED is
+# the last.
+MOST_STEPS, MOST_HALVINGS, SAME, CONVERGED = 40, 8, 1e-9, 1e-3
 
 
 class SensedShape:
@@ -111,7 +111,7 @@ class PointedShape:
             step[moving] = ahead
             z[moving] += ahead
             if k + 1 >= NEWTON_STEPS:
-                moving = moving[np.sum(ahead * right, axis=1) > SETTLED]
+                moving = moving[np.sum(ahead * right, axis=1) > CONVERGED]
                 if not moving.size:
                     return z
         z[moving] -= step[moving]  # which nothing has tried
