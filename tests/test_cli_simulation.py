@@ -33,6 +33,18 @@ def test_a_simulation_is_replayed_to_its_truth(bench: Path, capsys: pytest.Captu
         assert abs(p["estimate"] - p["true"]) < 4.0 * p["std"]
 
 
+def test_a_trajectory_that_no_controller_follows_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = shipped_text("paper-planar")
+    start = text.index("[controller]")
+    Path("free.toml").write_text(text[:start] + text[text.index("[trajectory]") :])
+    assert main(["simulate", "--system", "free.toml", "--capture", "sim.csv"]) == 2
+    assert "controller: no such table; expected gains that follow [trajectory]" in capsys.readouterr().err
+    assert not Path("sim.csv").exists()
+
+
 def test_the_seed_decides_the_capture(bench: Path) -> None:
     def capture(seed: str) -> bytes:
         arguments = ["simulate", "--system", "moved.toml", "--capture", "sim.csv", "--duration", "1", "--grade", "B"]

@@ -146,7 +146,7 @@ def test_the_integral_of_a_sign_is_as_uncertain_as_stated(noise: float) -> None:
     turns = random.uniform(0.19, 0.21, 60)
     angles = [np.where(t < turn, -3.0, -1.0) * (t - turn) ** 2 for turn in turns]
     segments = [Segment(np.arange(t.size), (a + noise * random.standard_normal(t.size))[:, None]) for a in angles]
-    reversals = Reversals(sensing, segments, 0, noise, 1000.0, SessionStandstill(sensing, segments, 0, noise, 1000.0))
+    reversals = Reversals(sensing, segments, noise, 1000.0, SessionStandstill(sensing, segments, 0, noise, 1000.0))
     samples = np.arange(100, 300)
     off, predicted = [], []
     for k, turn in enumerate(turns):

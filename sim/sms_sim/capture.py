@@ -71,6 +71,8 @@ class Simulated:
                 raise InputError("effects", effect.key, "nothing of it", expected)
         if duration is not None and not 0.0 < duration <= LONGEST:
             raise InputError("simulate", "duration", f"{duration:g} s", f"more than 0, at most {LONGEST:g} s")
+        if system.trajectory is not None and any(system.trajectory.joints) and system.controller is None:
+            raise InputError(system.name, "controller", "no such table", "gains that follow [trajectory]")
         whole = declaring(system, injected)
         drifts = parsed(drift)
         model = build_model(whole) if drifts else None
