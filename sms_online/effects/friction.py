@@ -59,7 +59,7 @@ class ViscousFriction(MotorSide):
         super().__init__(site, {"damping": (f"d_{site.index}", "N m s/rad", given.get("damping", 0.0))})
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-θ̇_m."""
+        """Minus the rate of the axis."""
         return -self.rate(layout, v)[:, None]
 
 
@@ -78,7 +78,7 @@ class CoulombFriction(MotorSide):
         super().__init__(site, {"torque": (f"c_{site.index}", "N m", given.get("torque", 0.0))})
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-sign(θ̇_m)."""
+        """Minus the sign of the rate of the axis."""
         return -sign(self.rate(layout, v))[:, None]
 
 
@@ -204,7 +204,7 @@ class LinkSide(MotorSide):
         return layout.q[self.index - 1]
 
 
-class BearingViscousFriction(LinkSide):
+class BearingViscousFriction(LinkSide, ViscousFriction):
     """f = -c q̇ on the link side of the spring, c `damping` in N m s/rad (N s/m on a prismatic joint).
 
     Limitations: linear, as viscous friction on the motor side.
@@ -216,14 +216,10 @@ class BearingViscousFriction(LinkSide):
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"damping": (f"d_b{site.index}", "N m s/rad", given.get("damping", 0.0))})
-
-    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-q̇."""
-        return -self.rate(layout, v)[:, None]
+        MotorSide.__init__(self, site, {"damping": (f"d_b{site.index}", "N m s/rad", given.get("damping", 0.0))})
 
 
-class BearingCoulombFriction(LinkSide):
+class BearingCoulombFriction(LinkSide, CoulombFriction):
     """f = -c sign(q̇) on the link side of the spring, c `torque` in N m (N on a prismatic joint).
 
     The spring carries it, so that it deflects by c / k where the axis comes to rest.
@@ -237,8 +233,4 @@ class BearingCoulombFriction(LinkSide):
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"torque": (f"c_b{site.index}", "N m", given.get("torque", 0.0))})
-
-    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-sign(q̇)."""
-        return -sign(self.rate(layout, v))[:, None]
+        MotorSide.__init__(self, site, {"torque": (f"c_b{site.index}", "N m", given.get("torque", 0.0))})
