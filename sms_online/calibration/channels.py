@@ -36,18 +36,23 @@ class Motion:
 
 @dataclass(frozen=True)
 class Family:
-    """Nuisances of one kind; adds: motion to what one unit of each adds to readings, (K, sensors, c)."""
+    """Nuisances of one kind; adds: motion to what one unit of each adds to readings, (K, sensors, c).
+
+    multiplies: sensors that each nuisance adds a multiple of their own readings to, none by default.
+    """
 
     nuisances: tuple[Nuisance, ...]
     adds: Callable[[Motion], Array]
+    multiplies: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)
 class TorqueFamily:
-    """Nuisances of torques; adds: motion to what one unit of each adds to n τ, (K, joints, c)."""
+    """Nuisances of torques; adds: motion to what one unit of each adds to n τ, (K, joints, c); multiplies: joints."""
 
     nuisances: tuple[Nuisance, ...]
     adds: Callable[[Motion], Array]
+    multiplies: tuple[tuple[int, ...], ...] = ()
 
 
 def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
@@ -92,6 +97,7 @@ def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFami
         TorqueFamily(
             tuple(Nuisance("drive_gain", f"joint_{i + 1}", "", tolerances.drive_gain, part) for i in gained),
             partial(_of_torque, gained),
+            tuple((i,) for i in gained),
         ),
         TorqueFamily(
             tuple(Nuisance("drive_offset", f"joint_{i + 1}", units[i], offset) for i in shifted),
@@ -176,7 +182,7 @@ def _camera(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) -> I
             Nuisance("camera_scale", "base and markers" if layout.free else "markers", "", tolerances.camera_scale),
         )
         seen = np.isin(np.arange(len(names)), metres)
-        yield Family(scale, lambda motion: (motion.readings * seen)[:, :, None])
+        yield Family(scale, lambda motion: (motion.readings * seen)[:, :, None], (tuple(metres),))
     spacecraft = sensing.model.system.spacecraft
     if spacecraft is None:
         return

@@ -8,7 +8,7 @@ is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
@@ -24,6 +24,7 @@ from sms_online.calibration.channels import (
     torque_families,
 )
 from sms_online.calibration.geometry import geometries
+from sms_online.calibration.multiplied_noise import Multiplied
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.calibration.truncation import Truncation, truncations
 from sms_online.model.model import Model
@@ -47,6 +48,16 @@ def nuisances(sensing: Sensing) -> tuple[Nuisance, ...]:
     torques = [each.nuisances for each in torque_families(sensing, system.tolerances)]
     channels = chain.from_iterable((*positions, *low_passes, *torques))
     return (*channels, *(each.nuisance for each in geometries(system)), *truncations(system))
+
+
+def _multiplied(families: Sequence[Family | TorqueFamily]) -> Iterator[Multiplied]:
+    """What nuisances multiply, of families in the order of their columns."""
+    first = 0
+    for family in families:
+        for k, chosen in enumerate(family.multiplies):
+            of_torques = isinstance(family, TorqueFamily)
+            yield Multiplied(first + k, () if of_torques else chosen, chosen if of_torques else ())
+        first += len(family.nuisances)
 
 
 def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
@@ -75,7 +86,8 @@ class CalibrationState(State):
 class CalibrationColumns(Stage):
     """Evaluates the columns window by window, at the instants of the sensitivities.
 
-    count: of nuisances. geometries: those of geometry, which come last but for those of truncation.
+    count: of nuisances. geometries: those of geometry, which come last but for those of truncation. multiplied: what
+    nuisances multiply.
     """
 
     def __init__(self, model: Model, sensing: Sensing, span: float) -> None:
@@ -84,6 +96,7 @@ class CalibrationColumns(Stage):
         self._positions = position_families(sensing, sensing.model.system.tolerances)
         self._low_passes = low_pass_families(sensing, sensing.model.system.tolerances)
         self._torques = torque_families(sensing, sensing.model.system.tolerances)
+        self.multiplied = tuple(_multiplied([*self._positions, *self._low_passes, *self._torques]))
         # Of the session's system: an event's may hold more that has a geometry.
         self.geometries = tuple(geometries(sensing.model.system))
         self._truncation = Truncation(model, span / INSTANTS)

@@ -9,12 +9,13 @@ and camera, are penalised by their tolerances throughout.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.multiplied_noise import Multiplied
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import Effect, System
 from sms_online.effects.catalogue import ENTRIES, places
@@ -36,18 +37,33 @@ def sayable(system: System) -> frozenset[str]:
 class Calibrated:
     """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is whitened.
 
-    sayable: see that function.
+    sayable: see that function. multiplied: what they and gains of torques multiply, with rows of synthetic noise
+    (W, n_v, ·) of each, see `MultipliedNoise`.
     """
 
     nuisances: tuple[Nuisance, ...]
     columns: Array
     sayable: frozenset[str]
+    multiplied: tuple[Multiplied, ...]
+    synthetic: Array
 
     @classmethod
-    def of(cls, nuisances: Sequence[Nuisance], columns: Array, system: System) -> Calibrated:
+    def of(
+        cls, nuisances: Sequence[Nuisance], columns: Array, system: System,
+        multiplied: Sequence[Multiplied], synthetic: Array,
+    ) -> Calibrated:  # fmt: skip
         """Nuisances that have a tolerance: where nothing is known, as of a torque's zero, the effect replaces them."""
         known = [k for k, each in enumerate(nuisances) if np.isfinite(each.tolerance)]
-        return cls(tuple(nuisances[k] for k in known), columns[..., known], sayable(system))
+        moved = tuple(
+            each if each.column is None else replace(each, column=known.index(each.column)) for each in multiplied
+        )
+        return cls(tuple(nuisances[k] for k in known), columns[..., known], sayable(system), moved, synthetic)
+
+    @classmethod
+    def none(cls, rows: Array) -> Calibrated:
+        """Nothing that the description may be off by, in rows (W, n_v)."""
+        nothing = np.empty((*rows.shape, 0))
+        return cls((), nothing, frozenset(), (), nothing)
 
     @property
     def count(self) -> int:

@@ -52,8 +52,8 @@ class CandidateFits:
         calibrated: Calibrated | None,
     ) -> None:
         """The arguments are those of `CandidateRows`."""
-        nothing = Calibrated((), np.empty((*rows.b.shape, 0)), frozenset())
-        self.calibrated, self._fixed = nothing if calibrated is None else calibrated, list(fixed)
+        self.calibrated = Calibrated.none(rows.b) if calibrated is None else calibrated
+        self._fixed = list(fixed)
         self.rows, self.candidates = rows, list(candidates)
         self._n, self._n_v = rows.Y.shape[2], rows.Y.shape[1]
         self._model = np.concatenate([rows.Y, *(candidate.columns for candidate in fixed)], axis=2)

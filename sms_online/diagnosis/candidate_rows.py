@@ -7,10 +7,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.calibration.multiplied_noise import shares
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate, Laws
 from sms_online.diagnosis.candidate_fits import CandidateFits
-from sms_online.diagnosis.evidence import together
+from sms_online.diagnosis.evidence import least_squares, together
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.scale_free import Scale
 from sms_online.diagnosis.weak_rows import WeakRows
@@ -183,13 +184,33 @@ class CandidateRows(CandidateFits):
         near = width if self.freed else 0
         self._known = len(known) + near + self.calibrated.count
         candidates = (candidate.columns for candidate in self.candidates)
-        parts = [self._model, rows.b[..., None], self.calibrated.columns, *candidates]
+        parts = [self._model, rows.b[..., None], self.calibrated.columns, self.calibrated.synthetic, *candidates]
         white = self._whitened(np.concatenate(parts, axis=2))
         white[first : first + len(known), :n], white[first : first + len(known), width] = known[:, :-1], known[:, -1]
         ends = np.cumsum([part.shape[2] for part in parts])
-        self._white, b, self._N, *self._Z = np.split(white, ends[:-1], axis=1)
+        self._white, b, self._N, synthetic, *self._Z = np.split(white, ends[:-1], axis=1)
         self._white_b = b[:, 0]
+        self._take_off_noise(synthetic[:first].reshape(*rows.b.shape, -1))
         self._linearise()
+
+    def _take_off_noise(self, synthetic: Array) -> None:
+        """Take off columns of gains what rows say of the noise that they multiply, see `multiplied_noise`.
+
+        synthetic (W, n_v, ·): whitened rows of such noise.
+        """
+        if not synthetic.size:
+            return
+        beside = np.concatenate([self._white, *(self._Z[k] for k in self._beside), self._N], axis=1)
+        size = self.rows.b.size
+        residual = (self._white_b - beside @ least_squares(beside, self._white_b))[:size].reshape(self.rows.b.shape)
+        squares = np.sum(synthetic**2, axis=0), np.sum(residual**2, axis=0)
+        expected = shares(*squares, len(synthetic)) * residual[:, :, None]
+        for each, noise in zip(self.calibrated.multiplied, expected.reshape(size, -1).T, strict=True):
+            if each.column is not None:
+                self._N[:size, each.column] -= noise
+            for candidate, columns in zip(self.candidates, self._Z, strict=True):
+                if "drive_gain" in candidate.traits.calibrates and candidate.effect.where in each.places:
+                    columns[:size, 0] += noise  # it multiplies what acts, not what is read
 
     def _linearise(self) -> None:
         """Have rows without a torque that leave more than noise count by their size, about the estimate beside those of

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.calibration.columns import CalibrationColumns, nuisances
+from sms_online.calibration.multiplied_noise import Multiplied
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import Segment
@@ -158,6 +159,9 @@ class SessionRows(WeakRows):
             self.second_order = self._second_order()
         sensing = self.sensing
         calibration = CalibrationColumns(model, sensing, balance.span)
+        known = {each.joints for each in calibration.multiplied}
+        joints = [(i,) for i, joint in enumerate(model.system.joints) if not joint.passive]
+        gains = [Multiplied(None, joints=each) for each in joints if each not in known]
         noise = WindowNoise(
             model,
             self.base,
@@ -165,10 +169,12 @@ class SessionRows(WeakRows):
             sensing.displacements,
             clock_groups(sensing),
             calibration if calibration.count else None,
+            gains,
         )
         covariances: list[list[Array]] = []
         responses: list[Array] = []
         columns: list[Array] = []
+        synthetic: list[Array] = []
         for part in self._parts:
             noise.begin(beta, self.noise, 0)
             self._extend(noise, part.instants)
@@ -180,13 +186,16 @@ class SessionRows(WeakRows):
             for propagated, added in zip(noise.push(part.windows, errors), part.displacements, strict=True):
                 covariances.append(propagated.covariances)
                 columns.append(propagated.calibration)
+                synthetic.append(propagated.multiplied)
                 # Sums over the steps, sensor by sensor.
                 by_sensor = propagated.kernel.transpose(2, 1, 0) * (balance.span / STEPS)
                 responses.append((by_sensor @ added.transpose(2, 1, 0)).transpose(2, 1, 0))
         stacked = np.array(responses).reshape(self.count, len(DISPLACEMENTS), model.layout.n_v, -1)
         self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
         of_calibration = np.array(columns).reshape(self.count, model.layout.n_v, calibration.count)
-        self.calibrated = Calibrated.of(nuisances(sensing), of_calibration, model.system)
+        multiplied = (*calibration.multiplied, *gains)
+        of_noise = np.array(synthetic).reshape(self.count, model.layout.n_v, len(multiplied))
+        self.calibrated = Calibrated.of(nuisances(sensing), of_calibration, model.system, multiplied, of_noise)
         self.have_noise(covariances)
 
     def _second_order(self) -> SecondOrderNoise:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from sms_online.calibration.columns import CalibrationColumns
+from sms_online.calibration.multiplied_noise import Multiplied, MultipliedNoise
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.latency import SourceGroup
@@ -31,13 +32,14 @@ class PropagatedNoise:
 
     covariances: with those of the windows before, then their own; see `RowNoise.covariances`. kernel (STEPS + 1, n_v,
     sensors): see `RowNoise.kernels`, rough forces included. late (n_v, sensors): see `RowNoise.lateness`. calibration
-    (n_v, ·): see `CalibrationColumns.windows`.
+    (n_v, ·): see `CalibrationColumns.windows`. multiplied (n_v, ·): see `MultipliedNoise`.
     """
 
     covariances: list[Array]
     kernel: Array
     late: Array
     calibration: Array
+    multiplied: Array
 
 
 class WindowNoiseState(State):
@@ -58,6 +60,7 @@ class WindowNoise(Stage):
 
     readings: x (K, n_x) to the displacements (K, n_v, sensors) that unit noise of each position sensor makes. clocks:
     see `RowNoise`. calibration: makes the columns beside Y. n_v: rows of a window. nuisances: columns of calibration.
+    multiplied: numbers of those that multiply noise. further: what else multiplies some, behind those.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class WindowNoise(Stage):
         readings: Callable[[Array], Array],
         clocks: Sequence[SourceGroup] = (),
         calibration: CalibrationColumns | None = None,
+        further: Sequence[Multiplied] = (),
     ) -> None:
         self.n_v = model.layout.n_v
         self._base, self._rough, self._wrenches = base, balance.rough, model.wrenches
@@ -78,6 +82,10 @@ class WindowNoise(Stage):
         self._noise = RowNoise(model.layout.theta_m, balance.span, clocks)
         self._calibration = calibration
         self.nuisances = 0 if calibration is None else calibration.count
+        multiplied = (*(() if calibration is None else calibration.multiplied), *further)
+        self.multiplied = tuple(each.column for each in multiplied if each.column is not None)
+        sensors = self._sensitivities.sensors
+        self._multiplied = MultipliedNoise(multiplied, sensors, model.layout.theta_m, balance.span)
         self.state = WindowNoiseState()
 
     def begin(self, beta: Array, noise: SensorNoise, instant: int) -> None:
@@ -91,6 +99,7 @@ class WindowNoise(Stage):
         if self._calibration is not None:
             self._calibration.forget(instant)
         self._noise.begin_segment()
+        self._multiplied.begin_segment()
         self.state.pushes, self.state.first = [], instant
 
     @property
@@ -160,4 +169,6 @@ class WindowNoise(Stage):
         calibration = np.empty((len(windows), self.n_v, 0))
         if self._calibration is not None:
             calibration = self._calibration.windows(starts, sensitivity, rough)
-        return [PropagatedNoise(*each) for each in zip(covariances, kernels, late, calibration, strict=True)]
+        multiplied = self._multiplied.push(kernels, noise.sensors, torque)
+        parts = zip(covariances, kernels, late, calibration, multiplied, strict=True)
+        return [PropagatedNoise(*each) for each in parts]

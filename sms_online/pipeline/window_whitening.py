@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.calibration.multiplied_noise import Shares
 from sms_online.pipeline.latency import LatencyColumns, SourceGroup
 from sms_online.pipeline.momentum_windows import Window
 from sms_online.pipeline.sensor_noise import SensorNoise
@@ -41,10 +42,12 @@ class WhitenedWindow:
 class WindowWhiteningState(State):
     """What weights were begun with.
 
-    misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
+    misfit (n_v,): variance of what the model lacks in each row, over that of the noise. reference (m + n,): nuisances
+    and β of the newest estimate, which residuals are of.
     """
 
     misfit: Array
+    reference: Array
 
 
 class WindowWhitening(Stage):
@@ -56,9 +59,11 @@ class WindowWhitening(Stage):
 
     def __init__(self, noise: WindowNoise, width: int, sources: Sequence[SourceGroup] = ()) -> None:
         self.noise = noise
-        self.state = WindowWhiteningState(np.zeros(noise.n_v))
+        self.state = WindowWhiteningState(np.zeros(noise.n_v), np.zeros(noise.nuisances))
         self._late = LatencyColumns(sources)
-        self._whitener = Whitener(width + len(sources) + noise.nuisances)
+        self._whitener = Whitener(width + len(sources) + noise.nuisances + len(noise.multiplied))
+        self._plain_shares = Shares(noise.multiplied, noise.n_v)
+        self._shares = Shares(noise.multiplied, noise.n_v)
 
     @property
     def misfit(self) -> Array:
@@ -75,9 +80,11 @@ class WindowWhitening(Stage):
 
         misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
         """
-        self.state.misfit = misfit
+        self.state.misfit, self.state.reference = misfit, np.append(np.zeros(self.noise.nuisances), beta)
         self.noise.begin(beta, noise, instant)
         self._whitener.begin_segment()
+        self._plain_shares.begin()
+        self._shares.begin()
 
     def begin_segment(self) -> None:
         """The next window begins a segment, and shares no samples with those before."""
@@ -99,8 +106,23 @@ class WindowWhitening(Stage):
         calibrated = width + len(self._late)
         if len(self._late):
             rows = np.concatenate((rows, self._late.of(noise.late)), axis=1)
-        if noise.calibration.shape[1]:
-            rows = np.concatenate((rows, noise.calibration), axis=1)
+        rows = np.concatenate((rows, noise.calibration, noise.multiplied), axis=1)
         white = self._whitener.push(noise.covariances, rows)
-        calibration = noise.calibration, white[:, calibrated:]
+        calibration = noise.calibration, white[:, calibrated : calibrated + noise.calibration.shape[1]]
+        if len(self.noise.multiplied):
+            std = np.sqrt(np.diag(own))[:, None]
+            synthetic = white[:, -len(self.noise.multiplied) :]
+            plain, whitened = calibration[0] / std, calibration[1]
+            residuals = self._residual(rows / std, plain), self._residual(white, whitened)
+            plain = self._plain_shares.taken_off(plain, noise.multiplied / std, residuals[0])
+            calibration = std * plain, self._shares.taken_off(whitened, synthetic, residuals[1])
         return WhitenedWindow(white[:, :width], white[:, width:calibrated], calibration, of_noise, own)
+
+    def refer(self, joint: Array) -> None:
+        """Take the newest estimate of nuisances, beside those that samples are corrected by, and of β (m + n,)."""
+        self.state.reference = joint
+
+    def _residual(self, rows: Array, N: Array) -> Array:
+        """What rows [Y b …] (n_v, ·) leave with the newest estimate."""
+        nuisances, beta = np.split(self.state.reference, [N.shape[1]])
+        return np.asarray(rows[:, beta.size] - rows[:, : beta.size] @ beta - N @ nuisances)

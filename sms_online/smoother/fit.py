@@ -23,6 +23,7 @@ from sms_online.model.model import Model
 from sms_online.model.readings import Readings
 from sms_online.physical import PhysicalSet
 from sms_online.pipeline.description import described
+from sms_online.smoother.averaging import FEWEST_TARGETS, LONGEST_STEP, averaged
 from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.span import Ending, Innovations, Span, interpolated
@@ -195,7 +196,7 @@ class _Search:
         self._model, self._base = smoother._model, smoother._base
         self.iterations = 0
         self.beta = beta
-        self.std = np.full(beta.size, np.inf)
+        self.std, self.factor = np.full(beta.size, np.inf), np.zeros((beta.size + 1, beta.size + 1))
         self.mean_square = np.inf
         self._asked, self._relaxation = np.zeros(beta.size), 1.0
         t = span.nodes(ROUGH_STEP)
@@ -255,14 +256,20 @@ class _Search:
                 return
 
     def converge(self, level: float) -> bool:
-        """Search until β converges, in so many steps at most; whether it does."""
-        try:
+        """Search until β converges or its steps scatter within its errors, in so many at most; whether it does."""
+        targets: list[Array] = []
+        with suppress(*NO_NUMBERS):
             for _ in range(MAX_STEPS):
+                before = self.beta
                 self.advance(level, tame=False)
-                if np.all(np.abs(self._asked) <= CONVERGED * self.std):
+                step = np.abs(self._asked)
+                if np.all(step <= CONVERGED * self.std):
                     return True
-        except NO_NUMBERS:
-            pass
+                targets = [*targets, before + self._asked] if np.all(step <= LONGEST_STEP * self.std) else []
+        if len(targets) >= FEWEST_TARGETS:
+            self.factor, self.beta = averaged(self.factor, targets[-FEWEST_TARGETS:])
+            self.std = np.sqrt(np.diag(solve(triangular_factor(self._known, self.factor)).covariance()))
+            return True
         self.mean_square = np.inf
         return False
 
