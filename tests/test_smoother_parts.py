@@ -13,9 +13,11 @@ from sms_online.linearised import Motion
 from sms_online.model.model import Model
 from sms_online.model.static_shape import SensedShape
 from sms_online.pipeline.sensing import Sensing
+from sms_online.smoother.averaging import averaged
 from sms_online.smoother.collocation import Transitions, defects
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.stream import Array
+from sms_online.trackers.factor import solve, triangular_factor
 from sms_sim.simulate import Simulation, exact_states, simulate
 from tests.one_link import one_link
 
@@ -152,3 +154,14 @@ def test_filter_and_smoother_equal_dense_least_squares() -> None:
     delta = np.linalg.lstsq(-innovations[:, 1:], innovations[:, 0], rcond=None)[0]
     assert_allclose(delta, expected_delta, rtol=1e-9)
     assert_allclose(second.smooth(expected_delta)[-1], expected_states[-1], rtol=1e-8, atol=1e-8)
+
+
+def test_minima_that_scatter_widen_the_covariance_by_their_scatter() -> None:
+    random = np.random.default_rng(4)
+    rows = random.standard_normal((40, 3))
+    targets = random.standard_normal((8, 3)) * [0.3, 0.0, 2.0] + [1.0, -2.0, 3.0]
+    factor, beta = averaged(triangular_factor(np.column_stack((rows, rows @ targets[0]))), list(targets))
+    assert_allclose(beta, targets.mean(axis=0))
+    found = solve(factor)
+    assert_allclose(found.covariance(), np.linalg.inv(rows.T @ rows) + np.cov(targets.T), rtol=1e-9)
+    assert_allclose(factor[:-1, :-1] @ beta, factor[:-1, -1], rtol=1e-9)

@@ -124,7 +124,7 @@ class Shares(Stage):
 
 
 def shares(synthetic: Array, residual: Array, windows: int) -> Array:
-    """Shares (n_v, nuisances) of noise in the residuals of rows, from the sums of squares of windows, see `SharesState`.
+    """Shares (n_v, nuisances) of noise in the residuals of rows, from sums of squares over windows: `SharesState`.
 
     Residuals larger than noise makes them are those of a poor fit; smaller ones mean that noise is overstated.
     """
