@@ -125,9 +125,12 @@ def validate(
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     # The rows of the joints' torques depend on no estimate; without a momentum balance no event changes the model.
     session = Estimator(system.model_copy(update={"balance": "energy"}), recorded.source.channels, recorded.name)
-    session.energy.begin_joints(session.model, session.base, session.sensing)
+    # Where shapes are not measured, no session has estimated gains.
+    sensing = None if session.sensing.missing else session.sensing
+    session.energy.begin_joints(session.model, session.base, sensing)
     gains = gains or {}
-    held = [gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in nuisances(session.sensing)]
+    described = () if sensing is None else nuisances(sensing)
+    held = [gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in described]
     motion = MotionRecord(system.sample_rate)
     session.observers.append(motion)
     for block in recorded.source:

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import tomllib
+from pathlib import Path
 
 import pytest
 
 import sms_online as sms
+from sms_tools.cli import main
+from sms_tools.exit_codes import INTERRUPTED
+from sms_tools.interruption import Interruption
 from tests.axis import AXIS, axis_block
 
 FRICTION = 0.05
 
 
+def axis_capture() -> sms.Capture:
+    block = axis_block(coulomb=FRICTION)
+    return sms.Capture.from_arrays(block.t, dict(zip(block.channels, block.values.T, strict=True)))
+
+
 @pytest.mark.slow
 def test_an_interrupted_search_reports_what_it_found() -> None:
-    block = axis_block(coulomb=FRICTION)
-    values = dict(zip(block.channels, block.values.T, strict=True))
+    capture = axis_capture()
     said: list[str] = []
 
     def stop() -> bool:
@@ -23,7 +31,7 @@ def test_an_interrupted_search_reports_what_it_found() -> None:
 
     found = sms.diagnose(
         sms.load_system(tomllib.loads(AXIS)),
-        sms.Capture.from_arrays(block.t, values),
+        capture,
         progress=lambda what, share: said.append(what),
         stop=stop,
     )
@@ -36,3 +44,27 @@ def test_an_interrupted_search_reports_what_it_found() -> None:
     assert effect.coefficients["torque"].unit == "N m"
     assert "coulomb_friction" in [each.name for each in found.system.effects]
     assert not any(text.startswith("fitting the model with") for text in said)
+
+
+@pytest.mark.slow
+def test_an_interrupted_search_rules_nothing_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("axis.toml").write_text(AXIS)
+    sms.write_capture(axis_capture(), Path("run.csv"))
+
+    class Pressed(Interruption):
+        """Ctrl-C at once."""
+
+        def __enter__(self) -> Interruption:
+            super().__enter__()
+            self.requested = True
+            return self
+
+    monkeypatch.setattr("sms_tools.verbs.diagnose.Interruption", Pressed)
+    assert main(["diagnose", "run.csv", "--system", "axis.toml", "--out", "found"]) == INTERRUPTED
+    said = capsys.readouterr().out
+    assert "no other effect is ruled out" in said
+    assert "no known effect explains" not in said
+    assert "Do not trust: the search was interrupted" in said

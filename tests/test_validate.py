@@ -9,6 +9,7 @@ import pytest
 
 import sms_online as sms
 from sms_tools.cli import main
+from tests.one_link import one_link
 from tests.test_compare import ELASTIC_AXIS, STIFFNESS
 
 
@@ -58,3 +59,11 @@ def test_the_verb_takes_the_folder_of_a_run(rig: Path, capsys: pytest.CaptureFix
 def test_a_parameter_without_a_value_is_refused(rig: Path) -> None:
     with pytest.raises(sms.InputError, match="a value of every parameter"):
         sms.validate(sms.load_system(rig / "rig.toml"), rig / "tuesday.csv", {"joint_1.stiffness": STIFFNESS})
+
+
+def test_a_link_whose_shape_is_not_measured_is_predicted_as_well() -> None:
+    system = one_link("linear")
+    capture = sms.simulate(system, duration=3.0, seed=1)
+    found = sms.validate(system, capture)
+    assert list(found.joints) == ["joint_1"]
+    assert 0.0 < found.joints["joint_1"].least <= found.joints["joint_1"].left

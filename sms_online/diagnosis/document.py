@@ -30,6 +30,9 @@ LEAST_FALL = 0.1
 # What was found by comparing whole descriptions competes with no columns.
 NO_RIVAL = {"next": None, "next_held_out_improvement": None}
 
+INTERRUPTED = "the search was interrupted, and has not decided what the model lacks"
+RUN_TO_THE_END = "let the diagnosis run to its end"
+
 
 @one_blas_thread()
 def diagnosis_document(
@@ -132,6 +135,8 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
     effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest, learned = _after(diagnosis, after), diagnosis.attempt.case.learned
+    if _undecided_yet(diagnosis):
+        return Trust("doubt", (Reason(INTERRUPTED, True, then=RUN_TO_THE_END), *rest.grounds), grave=True)
     if diagnosis.drifts:
         if diagnosis.estimator_after is not diagnosis.estimator_before:
             rest = trust_with(diagnosis.drifts, rest)
@@ -151,7 +156,19 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
 
 def summary(diagnosis: Search) -> str:
     """The verdict in a sentence, after one for each mistake."""
-    return f"Partial, the search was interrupted. {_whole(diagnosis)}" if diagnosis.partial else _whole(diagnosis)
+    if not diagnosis.partial:
+        return _whole(diagnosis)
+    said = _whole(diagnosis)
+    if _undecided_yet(diagnosis):
+        # What was not tried yet is not ruled out.
+        found = ", ".join(_named_in_words(diagnosis, effect) for effect in _named(diagnosis))
+        said = f"Found by then: {found or 'nothing'}; no other effect is ruled out."
+    return f"Partial, the search was interrupted. {said}"
+
+
+def _undecided_yet(diagnosis: Search) -> bool:
+    """Whether the search ended before it could know what the model lacks."""
+    return diagnosis.partial and diagnosis.verdict == "unexplained"
 
 
 def _whole(diagnosis: Search) -> str:

@@ -20,7 +20,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.tables import json_text
 from sms_online.truth import true_values
 from sms_tools.adopted_system import added_lines, adopted_text, remarks
-from sms_tools.exit_codes import NOTHING_DETERMINED, OK
+from sms_tools.exit_codes import INTERRUPTED, NOTHING_DETERMINED, OK
 from sms_tools.found_effects import cells_of, look_alikes, why
 from sms_tools.interruption import Interruption
 from sms_tools.report import Document, parameter_table, report_console, show, table, verdict_text
@@ -92,6 +92,8 @@ def run(args: argparse.Namespace) -> int:
     if view is not None:
         with Interruption() as interruption:
             view.linger(interruption)
+    if found.search.partial:
+        return INTERRUPTED
     return OK if any(p.determined for p in found.after.parameters.values()) else NOTHING_DETERMINED
 
 
