@@ -13,7 +13,7 @@ import sms_online as sms
 from sms_online.description.parse import parse_system
 from sms_online.stream import Array
 from sms_tools.cli import main
-from sms_tools.exit_codes import NOTHING_DETERMINED
+from sms_tools.exit_codes import BAD_INPUT, NOTHING_DETERMINED
 from tests.axis import AXIS, axis_block
 from tests.simulations import planar_capture
 
@@ -108,6 +108,15 @@ def test_what_is_the_matter_with_a_channel_is_named(change: Callable[[Array, Arr
 def test_times_in_milliseconds_are_recognised() -> None:
     found = grave(capture(t=lambda t: 1000.0 * t))
     assert "q_1: time in ms, not in s: a sample every 5" in found
+
+
+def test_a_replay_of_times_in_milliseconds_ends_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "axis.toml").write_text(AXIS + SENSORS)
+    run = sms.write_capture(capture(t=lambda t: 1000.0 * t), tmp_path / "run.csv")
+    out = tmp_path / "out"
+    assert main(["replay", str(run), "--system", str(tmp_path / "axis.toml"), "--out", str(out)]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert f'{run.name}, t: stamps in ms; expected s, or stamp_unit = "ms"' in said
 
 
 @pytest.mark.slow

@@ -178,12 +178,19 @@ class ChannelChecks:
         """What is the matter so far."""
         for check in self.checks:
             yield from check.remarks()
+        # Where a sensor says how often it samples, its channels are compared with that, and remarked upon already.
+        if (unit := self.other_unit_of_time) is not None and not self._described:
+            period = min(period for check in self.checks if (period := check.measured_period))
+            yield Remark("", f"time in {unit}, not in s: a sample every {period:g}", True)
+
+    @property
+    def other_unit_of_time(self) -> str | None:
+        """The unit that stamps are in where that is not s: one sensor at least samples as often as the system does."""
         periods = [period for check in self.checks if (period := check.measured_period)]
-        if periods and not self._described:
-            # No sensor says how often it samples, but one at least as often as the system does.
-            stamps = unit_of_stamps(min(periods) / self._tick, UNIT_TOLERANCE)
-            if stamps is not None:
-                yield Remark("", f"time in {stamps[0]}, not in s: a sample every {min(periods):g}", True)
+        if not periods:
+            return None
+        stamps = unit_of_stamps(min(periods) / self._tick, UNIT_TOLERANCE)
+        return None if stamps is None else stamps[0]
 
 
 class Checked:
@@ -243,6 +250,8 @@ def check(system: Given, data: Data) -> Check:
     for block in source:
         checks.push(block)
         outliers.push(block.t, block.values)
+        if checks.other_unit_of_time is not None:
+            estimator = None  # it would interpolate a thousand samples between two, for minutes
         if estimator is not None:
             estimator.push(block)
     outliers.push(np.empty(0), np.empty((0, len(source.channels))), last=True)

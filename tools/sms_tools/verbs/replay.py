@@ -12,6 +12,7 @@ from sms_adapters.data_check import ChannelChecks, Checked
 from sms_adapters.recorded import recorded_at
 from sms_online.capture import PIECE
 from sms_online.cramer_rao import MotionRecord, session_bound
+from sms_online.errors import InputError
 from sms_online.session import Session
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
@@ -53,10 +54,12 @@ def run(args: argparse.Namespace) -> int:
             pieces = (piece for block in reading for piece in block.pieces(rows))
             blocks = pieces if patient else _paced(pieces, interruption)
             say = partial(reading.console.print, soft_wrap=True)
-            checked = Checked(ChannelChecks(system, source.channels), lambda line: say(f"check: {line}"))
+            checks = ChannelChecks(system, source.channels)
+            checked = Checked(checks, lambda line: say(f"check: {line}"))
+            watched_blocks = _in_seconds(checked.watch(blocks), checks, capture)
             with showing(args, session, directory, recorded.truth, patient) as shown:
                 shown.follow(say)
-                feed(session, shown.watch(checked.watch(blocks)), interruption)
+                feed(session, shown.watch(watched_blocks), interruption)
                 wall = perf_counter() - opened
         bound = None if record is None else session_bound(session.estimator, record)
         warnings = [*source.warnings, *checked.warnings, *shown.warnings]
@@ -65,6 +68,14 @@ def run(args: argparse.Namespace) -> int:
         code = conclude(args, result, directory, interruption.requested)
         shown.report(result, interruption)
     return code
+
+
+def _in_seconds(blocks: Iterable[Block], checks: ChannelChecks, capture: Path) -> Iterator[Block]:
+    """The same blocks; InputError where stamps are in another unit: samples between would be interpolated."""
+    for block in blocks:
+        if (unit := checks.other_unit_of_time) is not None:
+            raise InputError(str(capture), "t", f"stamps in {unit}", f's, or stamp_unit = "{unit}" under a [[source]]')
+        yield block
 
 
 def _paced(blocks: Iterable[Block], interruption: Interruption) -> Iterator[Block]:
