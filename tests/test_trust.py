@@ -134,6 +134,14 @@ def test_what_the_model_lacks_is_said_in_place_of_calibration_errors() -> None:
     assert off in judge(replace(GOOD, miscalibrated=(off,))).grounds
 
 
+@pytest.mark.parametrize(("short", "left", "advised"), [(True, 0.01, True), (False, 0.01, False), (True, 0.5, False)])
+def test_a_short_session_is_advised_to_record_for_longer(short: bool, left: float, advised: bool) -> None:
+    # So few windows do not show whether it is a force; where half of a torque is left, it is no noise.
+    judgement = judge(replace(with_row("joint_2", relative=left, whitened=9.0), short=short))
+    assert judgement.grave
+    assert any("record for longer" in reason.then for reason in judgement.grounds) == advised
+
+
 def test_lost_samples_come_before_their_residual() -> None:
     judgement = judge(replace(with_row("joint_2", whitened=19.0), lost=0.02))
     assert judgement.sentence == "Do not trust: 2 % of the samples are lost"

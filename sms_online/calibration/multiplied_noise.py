@@ -79,14 +79,15 @@ class MultipliedNoise(Stage):
         steps = np.concatenate((now.steps, now.random.standard_normal((missing, now.steps.shape[1]))))
         now.steps = steps[W * STEPS_A_HOP :]
         size = np.sqrt(self._step * np.concatenate((sensor_density, torque_density)))
-        for k in range(W):
-            noise = steps[k * STEPS_A_HOP :][: STEPS + 1] * size
-            torque = self._phi @ noise[:, sensors:]
-            for column, each in zip(out[k].T, self._multiplied, strict=True):
-                for s in each.sensors:
-                    column -= np.einsum("kv,k->v", kernels[k, :, :, s], noise[:, s])
-                for i in each.joints:
-                    column[self._joint_rows[i]] += torque[i]
+        at = STEPS_A_HOP * np.arange(W)[:, None] + np.arange(STEPS + 1)
+        noise = steps[at] * size  # (W, STEPS + 1, sensors + joints)
+        torque = self._phi @ noise[:, :, sensors:]
+        for column, each in zip(out.transpose(2, 0, 1), self._multiplied, strict=True):
+            if each.sensors:
+                seen = list(each.sensors)
+                column -= np.einsum("wkvs,wks->wv", kernels[..., seen], noise[..., seen], optimize=True)
+            for i in each.joints:
+                column[:, self._joint_rows[i]] += torque[:, i]
         return out
 
 

@@ -45,9 +45,14 @@ class Persistence(Stage):
         if len(self.state.rows) > KEPT:
             self.state.rows.pop(0)
 
+    @property
+    def decides(self) -> bool:
+        """Whether there are windows enough to show whether what they leave lasts."""
+        return len(self.state.rows) >= LEAST_WINDOWS
+
     def passing(self, beta: Array) -> NDArray[np.bool_]:
         """Of which rows (k,) what is left by nuisances and parameters β (m + n,) is shown not to last."""
-        if len(self.state.rows) < LEAST_WINDOWS:
+        if not self.decides:
             return np.zeros(len(self.state.rows[0]) if self.state.rows else 0, dtype=np.bool_)
         left = np.array(self.state.rows) @ np.append(beta, -1.0)
         left = left / np.sqrt(np.mean(left**2, axis=0))

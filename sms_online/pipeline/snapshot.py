@@ -52,6 +52,7 @@ def _of_momentum(momentum: Momentum, t: float) -> MomentumStatistics:
         tested=momentum.testable,
         alarm=None if alarm is None else alarm.row,
         passing=_passing(momentum),
+        short=alarm is not None and not momentum.test.persistence.decides,
         scale_free=momentum.joint.scale_free(momentum.fit),
         latency=momentum.latencies.found,
         coloured={} if noise is None else noise.coloured,

@@ -85,10 +85,11 @@ class MomentumStatistics:
     nothing has moved. tracker: its rows so far; bias: what noise in its columns does. rows: unwhitened rows and their
     misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
     rows that the sequential test finds more than noise in. passing: of types of joints' rows whose residual does not
-    last, the torque's channel and the 1σ of its samples that is used. scale_free: what gives the estimate where rows
-    leave more than noise. latency: source that is late against the others, if one is. coloured, jitters (1σ by device):
-    see `SensorNoise`. suspected: a change of parameters that the judged tracker does not follow; unwatched: none is
-    looked for. shifts: of the devices' clocks. point (m,): nuisances that samples are corrected by.
+    last, the torque's channel and the 1σ of its samples that is used. short: too few windows show that. scale_free:
+    what gives the estimate where rows leave more than noise. latency: source that is late against the others, if one
+    is. coloured, jitters (1σ by device): see `SensorNoise`. suspected: a change of parameters that the judged tracker
+    does not follow; unwatched: none is looked for. shifts: of the devices' clocks. point (m,): nuisances that samples
+    are corrected by.
     """
 
     trackers: tuple[Reading, ...]
@@ -100,6 +101,7 @@ class MomentumStatistics:
     tested: bool
     alarm: str | None
     passing: dict[str, tuple[str, float]]
+    short: bool
     scale_free: ScaleFree | None
     latency: Latency | None
     coloured: dict[str, float]

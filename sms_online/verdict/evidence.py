@@ -67,9 +67,10 @@ class Evidence:
     jitters: 1σ, s, by which stamps of devices are off at random.
     coloured: correlation time of the noise, s, by channel.
     noisy: by type of rows that leave more than noise, the torque's channel and the 1σ that they leave, see `noisier`.
+    short: whether rows leave more than noise in too few windows to show whether that lasts.
     miscalibrated: what is off by more than the description's tolerances allow.
     troubles: of the devices, the recording and the machine of a live session, a short sentence each.
-    weaknesses: of an estimate by the way it is made, a short sentence each.
+    weaknesses: of an estimate by the way it is made.
     suspected: parameters that seem to move, which the judged tracker does not follow.
     still: whether the tracker that was asked for lets no parameter move.
     unwatched: s of a session in which no drift is watched for and none is followed; 0 elsewhere.
@@ -96,9 +97,10 @@ class Evidence:
     jitters: Mapping[str, float] = field(default_factory=dict)
     coloured: Mapping[str, float] = field(default_factory=dict)
     noisy: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    short: bool = False
     miscalibrated: tuple[Reason, ...] = ()
     troubles: tuple[str, ...] = ()
-    weaknesses: tuple[str, ...] = ()
+    weaknesses: tuple[Reason, ...] = ()
     suspected: Suspected | None = None
     still: bool = False
     unwatched: float = 0.0

@@ -14,8 +14,9 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.synchronise import SIDE
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
-from sms_online.verdict.reasons import unexplained_torques
+from sms_online.verdict.reasons import DECLARE, unexplained_torques
 from sms_online.verdict.torque_noise import noisy_torques
+from sms_online.verdict.trust import Reason
 
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
@@ -45,6 +46,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         jitters={} if momentum is None else momentum.jitters,
         coloured={} if momentum is None else momentum.coloured,
         noisy={} if momentum is None else noisy_torques(evaluation.residuals, momentum.passing),
+        short=momentum is not None and momentum.short,
         miscalibrated=(*miscalibrated(evaluation), *ambiguous_effects(evaluation)),
         troubles=tuple(troubles),
         weaknesses=tuple(_weaknesses(now)),
@@ -114,19 +116,21 @@ def _slow(now: Statistics) -> dict[str, float]:
     return {name: 1.0 / period for name, period in periods.items() if is_slow(period, window)}
 
 
-def _weaknesses(now: Statistics) -> list[str]:
+def _weaknesses(now: Statistics) -> list[Reason]:
     """What weakens an estimate by the way it is made."""
-    out, by_smoother = [], now.method == "smoother"
+    out: list[Reason] = []
+    by_smoother = now.method == "smoother"
     if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
-        out.append("samples do not agree with the equations of motion")
+        # What acts there is no white force, and shifts parameters by more than white ones of its size would.
+        out.append(Reason("samples do not agree with the equations of motion", True, then=DECLARE))
     if by_smoother and any(value != 0.0 for value in now.setup.system.tolerances.model_dump().values()):
-        out.append("the smoother's error bars do not include the tolerances of geometry and calibration")
+        out.append(Reason("the smoother's error bars do not include the tolerances of geometry and calibration", False))
     if now.momentum is None and not by_smoother:
-        out.append("by the energy balance alone, nothing tests whether the model lacks something")
+        out.append(Reason("by the energy balance alone, nothing tests whether the model lacks something", False))
     if now.smoother is not None and not by_smoother and now.setup.sensing.missing:
-        out.append("links are taken to bend quasi-statically: estimates are off by several percent")
+        out.append(Reason("links are taken to bend quasi-statically: estimates are off by several percent", False))
     late = None if now.momentum is None else now.momentum.latency
     if late is not None:
         whose = late.source if late.size > 0.0 else f"all sources but {late.source}"
-        out.append(f"{whose}: {1e3 * abs(late.size):.2g} ms later than stated")
+        out.append(Reason(f"{whose}: {1e3 * abs(late.size):.2g} ms later than stated", False))
     return out

@@ -52,8 +52,9 @@ def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
     out = [*reasons.scaled(evidence.comparison), *reasons.lacking(evidence.discrepancies)]
     if converged:
         rows = [*reasons.unexplained_torques(residual), *reasons.beyond_limit(residual)]
+        rows = reasons.or_short(rows, residual) if evidence.short else rows
         out += reasons.or_drifting(rows) if evidence.still else rows
-        out += [each for each in evidence.miscalibrated if each.grave]
+        out += [each for each in (*evidence.miscalibrated, *evidence.weaknesses) if each.grave]
     out += _unnamed(evidence, noisy=False)
     out += [each for each in alarmed if each.grave]
     if converged:
@@ -84,7 +85,7 @@ def _cautions(evidence: Evidence) -> list[Reason]:
     """What makes some of the numbers, or their error bars, worse than they look."""
     out = reasons.weak_torques(evidence.residual)
     out += [each for each in evidence.miscalibrated if not each.grave]
-    out += [*sample_reasons.troubled(evidence.troubles), *(Reason(text, False) for text in evidence.weaknesses)]
+    out += [*sample_reasons.troubled(evidence.troubles), *(each for each in evidence.weaknesses if not each.grave)]
     out += noisier(evidence.noisy, evidence.residual)
     out += [replace(each, grave=False) for each in _unnamed(evidence, noisy=True)]
     out += [*reasons.beyond_noise(_lasting(evidence)), *reasons.apart(evidence.comparison)]

@@ -43,9 +43,14 @@ CHECK_ROWS = f"check geometry, clocks and stated noise of the sensors in these r
 CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
+DECLARE = (
+    "declare friction of the joints and damping of the links (`link_damping`), and state `hold` of held torques; "
+    "with slopes measured too, `sms-online diagnose` says which of them is missing"
+)
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
+LONGER = "record for longer: so few windows do not show whether it is noise of the torques or a force; else "
 OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
 MOVE = "move all joints, faster and over a larger range, and long enough"
@@ -140,6 +145,13 @@ def beyond_limit(residual: Residuals) -> list[Reason]:
     )
     mark = f"{noise:.0f} × noise"
     return [Reason(f"the residual of {worst} is {mark}", True, (worst,), mark, full, CHECK_ROWS)]
+
+
+def or_short(found: Sequence[Reason], residual: Residuals) -> list[Reason]:
+    """The same of a session too short to show whether it is noise, where all torques are nearly explained."""
+    if any(rows.relative is not None and rows.relative > NOISE_RESIDUAL for rows in residual.values()):
+        return list(found)
+    return [replace(each, then=LONGER + each.then) for each in found]
 
 
 def or_drifting(found: Sequence[Reason]) -> list[Reason]:
