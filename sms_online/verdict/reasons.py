@@ -44,7 +44,7 @@ CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state i
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
 DECLARE = (
-    "declare friction of the joints and damping of the links (`link_damping`), and state `hold` of held torques; "
+    "declare friction of the joints and damping of the links, and state `hold` of held torques; "
     "with slopes measured too, `sms-online diagnose` says which of them is missing"
 )
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
