@@ -1,7 +1,7 @@
 """Independent tasks on the cores of one machine, or on a Dask cluster; a task that fails is a row that says why.
 
 A worker that dies takes no row with it: what it worked on is done again, alone, for it may have been the reason. What
-kills its worker alone, too, fails.
+kills its worker alone twice fails: it may not have begun before another one's worker died.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def outcome(work: Work, arguments: tuple[object, ...]) -> Row:
 
 
 def _on_cores(work: Work, tasks: Tasks, workers: int) -> Iterator[tuple[str, Row]]:
-    waiting, suspects = deque(tasks), deque[str]()
+    waiting, suspects, killers = deque(tasks), deque[str](), set[str]()
     running: dict[Future[Row], str] = {}
     pool = _pool(work, workers)
     try:
@@ -83,7 +83,12 @@ def _on_cores(work: Work, tasks: Tasks, workers: int) -> Iterator[tuple[str, Row
                 pool.shutdown()
                 pool = _pool(work, workers)
                 if alone:
-                    yield running.popitem()[1], {"error": KILLED}
+                    key = running.popitem()[1]
+                    if key in killers:
+                        yield key, {"error": KILLED}
+                    else:
+                        killers.add(key)
+                        suspects.appendleft(key)
                 # All that ran are broken with the pool, but for those that were finished just before.
                 for future in list(running):
                     key = running.pop(future)
