@@ -198,19 +198,23 @@ class CandidateRows(CandidateFits):
 
         synthetic (W, n_v, ·): whitened rows of such noise.
         """
-        if not synthetic.size:
+        size, multiplied = self.rows.b.size, self.calibrated.multiplied
+        gained = [
+            (k, self._N[:size, each.column], -1.0) for k, each in enumerate(multiplied) if each.column is not None
+        ]
+        for candidate, columns in zip(self.candidates, self._Z, strict=True):
+            if "drive_gain" in candidate.traits.calibrates:
+                # It multiplies what acts, not what is read.
+                own = (k for k, each in enumerate(multiplied) if candidate.effect.where in each.places)
+                gained += [(k, columns[:size, 0], 1.0) for k in own]
+        if not gained:
             return
         beside = np.concatenate([self._white, *(self._Z[k] for k in self._beside), self._N], axis=1)
-        size = self.rows.b.size
         residual = (self._white_b - beside @ least_squares(beside, self._white_b))[:size].reshape(self.rows.b.shape)
         squares = np.sum(synthetic**2, axis=0), np.sum(residual**2, axis=0)
-        expected = shares(*squares, len(synthetic)) * residual[:, :, None]
-        for each, noise in zip(self.calibrated.multiplied, expected.reshape(size, -1).T, strict=True):
-            if each.column is not None:
-                self._N[:size, each.column] -= noise
-            for candidate, columns in zip(self.candidates, self._Z, strict=True):
-                if "drive_gain" in candidate.traits.calibrates and candidate.effect.where in each.places:
-                    columns[:size, 0] += noise  # it multiplies what acts, not what is read
+        expected = (shares(*squares, len(synthetic)) * residual[:, :, None]).reshape(size, -1)
+        for k, column, sign in gained:
+            column += sign * expected[:, k]
 
     def _linearise(self) -> None:
         """Have rows without a torque that leave more than noise count by their size, about the estimate beside those of
