@@ -61,11 +61,13 @@ def with_friction(*effects: Effect) -> System:
     return rigid_arm(*laws, *effects)
 
 
-def recorded(system: System, duration: float, seed: int, carried: Array | None = None) -> Capture:
+def recorded(
+    system: System, duration: float, seed: int, carried: Array | None = None, lost: Array | None = None
+) -> Capture:
     """Samples of the arm on a trajectory of five sines an axis, from inverse dynamics: no motion is integrated.
 
     Torques have 1 % noise of 0.2 s memory and white noise of 0.5 %, encoders 1e-5 rad. carried (B,): factor of what the
-    payload weighs, of a system that has one.
+    payload weighs, of a system that has one. lost (n,): share of each gear's load, friction aside, that it loses.
     """
     rng = np.random.default_rng(seed)
     model = build_model(system)
@@ -86,6 +88,10 @@ def recorded(system: System, duration: float, seed: int, carried: Array | None =
         own = np.array([p.name.startswith("payload.") for p in model.parameters])
         empty = torque(np.where(own, 0.0, model.nominal))
         tau = empty + carried[:, None] * (tau - empty)
+    if lost is not None:
+        plain = build_model(system.model_copy(update={"effects": ()}))
+        H, C = plain.dynamics(plain.nominal).mass_and_bias(x, v)
+        tau = tau + lost * np.abs(np.einsum("bij,bj->bi", H, acceleration) + C) * np.sign(v)
     size = np.sqrt(np.mean(tau**2, axis=0))
     memory = np.exp(-1.0 / (0.2 * system.sample_rate))
     slow = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], rng.normal(size=tau.shape), axis=0)

@@ -1,4 +1,4 @@
-"""A shaft that turns with the sum of two axes, and a spring that carries weight, on a rigid arm of three axes."""
+"""Shafts that turn with the sum of two axes, springs that carry weight, gears under load: a rigid arm of three axes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from sms_online.diagnosed import diagnose
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import candidates, check_effect
 from sms_online.errors import InputError
+from sms_online.model.effect import Inputs
 from tests.model_systems import random_states
 from tests.rigid_arm import recorded, rigid_arm, with_friction
 
@@ -61,6 +62,19 @@ def test_a_gravity_spring_carries_weight_of_its_axis_alone() -> None:
     assert model.effects[0].reported(model.nominal[own]) == pytest.approx({"amplitude": 20.0, "phase": 0.3})
 
 
+def test_friction_of_a_rigid_gear_goes_with_the_torque() -> None:
+    declared = Effect(name="load_friction", where="joint_2", coefficients={"ratio": 0.04})
+    model = build_model(rigid_arm(declared))
+    x, v = random_states(model.layout, STATES, seed=4)
+    torque = np.random.default_rng(5).normal(size=(STATES, 3))
+    own = model.effect_slices[0]
+    force = model.momentum_columns(x, v, inputs=Inputs(torque, np.zeros((STATES, 0))))[1][..., own] @ model.nominal[own]
+    expected = np.zeros_like(force)
+    expected[:, 1] = -0.04 * np.abs(torque[:, 1]) * np.sign(v[:, 1])
+    assert_allclose(force, expected, rtol=1e-9, atol=1e-15)
+    assert model.effects[0].reported(model.nominal[own]) == {"ratio": 0.04}
+
+
 def test_only_axes_in_a_row_share_a_shaft() -> None:
     arm = rigid_arm()
     assert [e.where for e in candidates(arm) if e.name == "coupled_friction"] == ["joint_1+joint_2", PAIR]
@@ -83,3 +97,11 @@ def test_a_coupled_wrist_is_named() -> None:
     after = found.search.after.holdout.relative
     # Of the noise, 0.011 of the torque, a model with everything leaves as much.
     assert max(after["joint_2"], after["joint_3"]) < 0.015
+
+
+@pytest.mark.long
+def test_a_gear_that_loses_a_share_of_its_load_is_named() -> None:
+    """A share of the load itself, from which the motor's torque of the law differs by friction: in second order."""
+    found = diagnose(with_friction(), recorded(with_friction(), 20.0, seed=6, lost=np.array([0.0, 0.08, 0.0])))
+    assert [f.candidate.key for f in found.search.findings] == ["load_friction@joint_2"]
+    assert found.effects[0].coefficients["ratio"].value == pytest.approx(0.08, rel=0.1)

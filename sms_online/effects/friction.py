@@ -11,6 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from sms_online.description.channels import has_motor_side
 from sms_online.effects.base import STANDSTILL, Entry, Force, Ranges, Shape, Site, dahl_rate, position
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
@@ -143,32 +144,41 @@ class PreslidingFriction(MotorSide):
 
 
 class LoadFriction(MotorSide):
-    """f = -c |k δ| sign(θ̇_m): friction in proportion to the torque that the spring carries, δ = θ_m - q.
+    """f = -c |ℓ| sign(θ̇_m): friction in proportion to the load ℓ of the gear, c the `ratio`.
 
-    c: `ratio`; linear in π is c k, `friction_stiffness`, N m/rad.
-    Limitations: the load is the spring's torque alone, without the damper's; needs a flexible transmission.
+    Behind a flexible joint ℓ is the spring's torque k δ, δ = θ_m - q, and linear in π is c k, `friction_stiffness`,
+    N m/rad. Behind a rigid one ℓ is the motor's torque n τ, and c itself is linear.
+    Limitations: the spring's torque is without the damper's; the motor's holds that of friction and of the rotor.
     """
 
     entry = Entry(
-        "load_friction", "force", "flexible joint", {"ratio": ""}, "the same speeds under little and much load",
+        "load_friction", "force", "driven joint", {"ratio": ""}, "the same speeds under little and much load",
         # Gears lose up to a third of their load; one that loses more than half is locked by it.
         traits=Traits(course="dry", limits={"ratio": (0.0, 0.5)}),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        nominal = given.get("ratio", 0.0) * site.system.joints[site.index - 1].stiffness
-        super().__init__(site, {"friction_stiffness": (f"c k_{site.index}", "N m/rad", nominal)})
-        self.relative_to = (f"joint_{site.index}.stiffness",)
+        ratio, joint = given.get("ratio", 0.0), site.system.joints[site.index - 1]
+        if has_motor_side(joint):
+            super().__init__(site, {"friction_stiffness": (f"c k_{site.index}", "N m/rad", ratio * joint.stiffness)})
+            self.relative_to = (f"joint_{site.index}.stiffness",)
+        else:
+            super().__init__(site, {"ratio": (f"c_l{site.index}", "", ratio)})
+            self.needs_torque = True
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-|δ| sign(θ̇_m)."""
+        """-|δ| sign(θ̇_m) or -|n τ| sign(θ̇_m)."""
         motor, link = layout.theta_m[self.index - 1], layout.q[self.index - 1]
-        delta = position(layout, x, motor) - position(layout, x, link)
-        return -(np.abs(delta) * sign(v[:, motor]))[:, None]
+        if self.needs_torque:
+            assert inputs is not None
+            load = inputs.torque[:, self.index - 1]
+        else:
+            load = position(layout, x, motor) - position(layout, x, link)
+        return -(np.abs(load) * sign(v[:, motor]))[:, None]
 
     def reported(self, values: Array) -> dict[str, float]:
-        """c = c k / k."""
-        return {"ratio": float(values[0] / values[1])}
+        """c, which behind a spring is c k / k."""
+        return {"ratio": float(values[0] if self.needs_torque else values[0] / values[1])}
 
 
 class DirectionFriction(MotorSide):

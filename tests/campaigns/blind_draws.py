@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sms_adapters.system_file import load_system
+from sms_online.description.channels import has_motor_side
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.record import SampleRecord
@@ -105,7 +106,7 @@ class Draw:
                 return {"amplitude": size, "phase": phase, **shapes}
             case "load_friction":
                 assert joint is not None
-                return {"ratio": value / joint.stiffness}
+                return {"ratio": value / joint.stiffness if has_motor_side(joint) else value}
             case "link_damping":
                 return {"time": value / link.flexural_rigidity_z}  # type: ignore[union-attr]
             case "link_mass_damping":
