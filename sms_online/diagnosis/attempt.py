@@ -133,22 +133,34 @@ def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
 
 
 def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | None) -> None:
-    """Whiten the rows with parameters from a joint fit of the model and all candidates.
+    """Whiten the rows with parameters of the model alone where it explains them, else of a joint fit with candidates.
 
     Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
-    explain them it shrinks π, with π their noise, and with that their weight grows without end.
+    explain them it shrinks π, with π their noise, and with that their weight grows without end. Beside all candidates
+    π shrinks as well where rows are noisy, and what is noise exceeds the noise of that π.
+    """
+    beta, left = _iterated(rows, rows.Y, prior)
+    if _likely(rows, beta) and not any(row.beyond for row in ResidualTest(rows).of(left).values()):
+        return
+    columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
+    if candidates and LEAST_ROWS * columns.shape[2] <= rows.b.size:
+        beta, _ = _iterated(rows, columns, prior)
+    _reweight(rows, beta)
+
+
+def _iterated(rows: SessionRows, columns: Array, prior: Prior | None) -> tuple[Array, Array]:
+    """Parameters (n,) of rows whitened with themselves, and what they leave (W, n_v), by the columns of a joint fit.
+
+    Parameters that the prior keeps would hide that the rows have drawn the others to zero: they are the described ones
+    then.
     """
     value, size = described(rows.model, rows.base)
-    columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
-    if LEAST_ROWS * columns.shape[2] > rows.b.size:
-        columns = rows.Y
     std = np.ones_like(rows.b)
     for _ in range(STARTS):
         alone, beta = _beside_candidates(columns / std[..., None], rows.b / std, prior, value, size)
         rows.reweight(beta)
         std = rows.std
-    # Parameters that the prior keeps would hide that the rows have drawn the others to zero.
-    _reweight(rows, beta if _likely(rows, alone) else value)
+    return beta if _likely(rows, alone) else value, (rows.b - rows.Y @ beta) / std
 
 
 def _beside_candidates(columns: Array, b: Array, prior: Prior | None, value: Array, size: Array) -> tuple[Array, Array]:

@@ -289,6 +289,10 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     gauges = [strip for strip in strips if strip is not None]
     if entry.name == EncoderOffset.entry.name:
         return (*places(system, "angle"), *gauges)
+    if entry.name == TorqueDelay.entry.name:
+        # What one bus delivers, or one amplifier.
+        drives = list(places(system, entry.at))
+        return ("joint_*", *drives) if len(drives) > 1 else drives
     if entry.name == ActuatorDelay.entry.name:
         # Of a joint with one encoder it is that encoder's lag. The dead time of a controller, and that of one drive.
         drives = [name for name in places(system, "flexible joint") if name in places(system, entry.at)]

@@ -14,7 +14,7 @@ from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.synchronise import SIDE
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
-from sms_online.verdict.reasons import DECLARE, unexplained_torques
+from sms_online.verdict.reasons import DECLARE, MEASURE_SLOPES, unexplained_torques
 from sms_online.verdict.torque_noise import noisy_torques
 from sms_online.verdict.trust import Reason
 
@@ -124,7 +124,8 @@ def _weaknesses(now: Statistics) -> list[Reason]:
         # What acts there is no white force, and shifts parameters by more than white ones of its size would.
         out.append(Reason("samples do not agree with the equations of motion", True, then=DECLARE))
     if by_smoother and any(value != 0.0 for value in now.setup.system.tolerances.model_dump().values()):
-        out.append(Reason("the smoother's error bars do not include the tolerances of geometry and calibration", False))
+        text = "the smoother's error bars do not include the tolerances of geometry and calibration"
+        out.append(Reason(text, False, then=MEASURE_SLOPES))
     if now.momentum is None and not by_smoother:
         out.append(Reason("by the energy balance alone, nothing tests whether the model lacks something", False))
     if now.smoother is not None and not by_smoother and now.setup.sensing.missing:

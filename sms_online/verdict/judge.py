@@ -49,7 +49,9 @@ def judge(evidence: Evidence) -> Trust:
 def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
     """Reasons why the numbers are wrong by more than any error bar says, the strongest first."""
     converged, residual = not evidence.unconverged, _lasting(evidence)
-    out = [*reasons.scaled(evidence.comparison), *reasons.lacking(evidence.discrepancies)]
+    scaled = reasons.scaled(evidence.comparison)
+    # A factor with a known cause explains the rest; without one, what the model lacks may have made it.
+    out = [*(scaled if evidence.comparison.cause else ()), *reasons.lacking(evidence.discrepancies)]
     if converged:
         rows = [*reasons.unexplained_torques(residual), *reasons.beyond_limit(residual)]
         rows = reasons.or_short(rows, residual) if evidence.short else rows
@@ -57,6 +59,7 @@ def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
         out += [each for each in (*evidence.miscalibrated, *evidence.weaknesses) if each.grave]
     out += _unnamed(evidence, noisy=False)
     out += [each for each in alarmed if each.grave]
+    out += () if evidence.comparison.cause else scaled
     if converged:
         out += [*reasons.negative(evidence.negative), *reasons.disputed(evidence.disputed)]
     return out

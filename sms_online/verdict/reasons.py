@@ -47,6 +47,7 @@ DECLARE = (
     "declare friction of the joints and damping of the links, and state `hold` of held torques; "
     "with slopes measured too, `sms-online diagnose` says which of them is missing"
 )
+MEASURE_SLOPES = "measure slopes of the links too: the momentum balance includes the tolerances"
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
 WEIGH = "weigh one part and state it under [known], or measure a torque constant"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
