@@ -25,6 +25,7 @@ from sms_online.diagnosis.rough_fit import RoughRows, stretches
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.catalogue import lag_places
 from sms_online.effects.delay import HELD, LONGEST_FOUND, delay_of, lag, lagging, late_keys
+from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
 
 # Corners that are tried first, Hz, from that of the longest delay to that of 3 ms; rows of a stiff spring show no more
@@ -84,7 +85,7 @@ class LateSensor:
 class Lags:
     """Asks how well readings can be explained with a lag taken off; rows: model and sensors, segments: samples."""
 
-    def __init__(self, rows: SessionRows, segments: Sequence[Segment]) -> None:
+    def __init__(self, rows: Estimator | SessionRows, segments: Sequence[Segment]) -> None:
         self._rows, self._segments = rows, list(segments)
         self._independent = 0
 
@@ -111,9 +112,9 @@ class Lags:
         """
         segments = self._segments
         if where is not None:
-            system = self._rows.model.system
-            lagging = system.model_copy(update={"effects": (lag(where, corner),)})
-            segments = [corrected(lagging, self._rows.sensing.channels, segment) for segment in segments]
+            # The samples are free of what is declared, latencies of sensors included.
+            late = self._rows.model.system.model_copy(update={"effects": (lag(where, corner),), "sensors": ()})
+            segments = [corrected(late, self._rows.sensing.channels, segment) for segment in segments]
         try:
             rough = RoughRows(self._rows, segments)
         except np.linalg.LinAlgError:
