@@ -17,10 +17,10 @@ from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.mistakes import Corrected, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord, Segment
-from sms_online.diagnosis.sample_mistakes import shown, without_gaps
+from sms_online.diagnosis.sample_mistakes import mistake_hypotheses, shown, without_gaps
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array, Block
-from sms_sim.simulate import sampled_blocks, simulate
+from sms_sim.simulate import Simulation, sampled_blocks, simulate
 from sms_tools.adopted_system import adopted_text
 from tests import simulations
 from tests.campaigns.mistakes import described
@@ -37,20 +37,30 @@ def stated() -> System:
 
 @cache
 def session(seed: int) -> Block:
-    blocks = list(sampled_blocks(simulations.planar(DURATION), "B", seed=seed))
+    return noisy(simulations.planar(DURATION), seed)
+
+
+def noisy(exact: Simulation, seed: int) -> Block:
+    blocks = list(sampled_blocks(exact, "B", seed=seed))
     t, values = (np.concatenate([getattr(block, part) for block in blocks]) for part in ("t", "values"))
     return Block(t, blocks[0].channels, values)
 
 
 def wrong(change: Change, seed: int = 4) -> Block:
-    block = session(seed)
+    return changed(session(seed), change)
+
+
+def changed(block: Block, change: Change) -> Block:
     values = {c: column.copy() for c, column in zip(block.channels, block.values.T, strict=True)}
     change(values)
     return Block(block.t, block.channels, np.stack(list(values.values()), axis=1))
 
 
 def found(change: Change, system: System | None = None) -> Corrected:
-    block, system = wrong(change), system or stated()
+    return found_in(wrong(change), system or stated())
+
+
+def found_in(block: Block, system: System) -> Corrected:
     estimator, record = Estimator(system, block.channels, "test"), SampleRecord(system.sample_rate)
     estimator.observers.append(record)
     estimator.push(block)
@@ -119,6 +129,34 @@ def test_a_wrong_torque_constant_is_no_wrong_gear() -> None:
     block = wrong(times(1.6, "tau_2"))
     undone = corrected.samples(block.channels, block.values)
     np.testing.assert_allclose(undone, session(4).values, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_a_passive_joint_has_no_torque_to_mistake() -> None:
+    """6 s of the planar example with a second joint that nothing drives, grade B (seed 4)."""
+    system = load_system("paper-planar")
+    joints = list(system.joints)
+    joints[1] = joints[1].model_copy(update={"passive": True, "gear_ratio": 1.0})
+    system = system.model_copy(update={"joints": tuple(joints)})
+    block = noisy(simulate(system, DURATION, position_tolerance=1e-8), 4)
+    (mistake,) = found_in(changed(block, times(-1.0, "tau_1")), system).mistakes
+    assert mistake.key == "torque_sign@tau_1"
+    assert not mistake.or_else
+
+
+def test_a_sliding_axis_is_a_length_and_a_wrench_is_neither_length_nor_angle() -> None:
+    joints = list(stated().joints)
+    joints[1] = joints[1].model_copy(update={"kind": "prismatic"})
+    system = stated().model_copy(update={"joints": tuple(joints)})
+    channels = ("force_2", "q_1", "q_2", "theta_m_1", "theta_m_2", "wrench_1.f_x", "wrench_1.m_z")
+    keys = {(each.name, each.where) for each in mistake_hypotheses(system, channels)}
+    assert {where for name, where in keys if name == "millimetres"} == {"q_2", "theta_m_2", "all lengths"}
+    assert {where for name, where in keys if name == "degrees"} == {"q_1", "theta_m_1", "all angles"}
+    assert not any("wrench" in where for name, where in keys if name != "swapped")
+    resting = np.ones((5000, len(channels)))
+    resting[:, 1] = np.linspace(0.0, 1.0, 5000)
+    resting[:2500, 5] = np.random.default_rng(6).standard_normal(2500)
+    assert list(shown(channels, [Segment(np.arange(5000), resting)])) == []
 
 
 @pytest.mark.long

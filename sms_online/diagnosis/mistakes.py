@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sms_online.description.channels import drive_channel
+from sms_online.description.channels import drive_channels
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rough_fit import SMALLEST, RoughFit, RoughRows, stretches
@@ -122,7 +122,7 @@ class _Search:
         self._channels = session.sensing.channels
         self._segments = list(segments)
         self._undone: list[MistakeHypothesis] = []
-        self._drives = [drive_channel(self.system, i) for i in range(1, len(self.system.joints) + 1)]
+        self._drives = {i - 1: name for name, i in drive_channels(self.system).items()}
 
     def undo(self, channels: tuple[str, ...], values: Array) -> Array:
         """Samples without the mistakes found."""
@@ -235,7 +235,7 @@ class _Search:
 
     def _torques(self, rows: RoughRows) -> Iterator[_Tried]:
         """Known factors of each joint's torque and of all, and the gear ratio of each that the other rows ask for."""
-        joints, stated = range(len(self._drives)), rows.stated()
+        joints, stated = list(self._drives), rows.stated()
 
         def likely(which: Sequence[int], factor: float) -> bool:
             known = stated[list(which)]
@@ -243,7 +243,7 @@ class _Search:
             return bool(np.all(np.abs(np.log(abs(factor) * known)) <= np.abs(np.log(known)) + np.log(MOST_OFF)))
 
         def times(which: Sequence[int], factor: float) -> Array:
-            factors = np.ones(len(joints))
+            factors = np.ones(stated.size)
             factors[list(which)] = factor
             return factors
 

@@ -10,6 +10,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.channels import channel_unit
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.sample_faults import stuck_samples, wrapped_at
@@ -42,7 +43,7 @@ class MistakeHypothesis:
 def shown(channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[MistakeHypothesis]:
     """What samples of some channels show by themselves: encoders wrapped or stuck, steps of a held command."""
     drives = [c for c in channels if _is_drive(c)]
-    positions = [c for c in channels if c not in drives]
+    positions = _positions(channels)
     stuck = list(_stuck(positions, channels, segments))
     yield from stuck
     # Where a stuck encoder goes on it jumps, too.
@@ -55,26 +56,17 @@ def _is_drive(channel: str) -> bool:
     return channel.startswith(("tau_", "force_"))
 
 
+def _positions(channels: Sequence[str]) -> list[str]:
+    return [c for c in channels if not (_is_drive(c) or c.startswith("wrench_"))]
+
+
 def mistake_hypotheses(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     """What may be wrong with samples of some channels, but for scales of torques."""
-    positions = [c for c in channels if not _is_drive(c)]
+    positions = _positions(channels)
     yield from _signs(positions)
     yield from _units(system, positions)
     yield from _geared(system, channels)
     yield from _swaps(channels)
-
-
-def is_angle(system: System, channel: str) -> bool:
-    """Whether a channel of positions is an angle, in rad."""
-    field = channel.rpartition(".")[2]
-    if field.startswith(("theta", "strain_angle")) or channel == "theta_0":
-        return True
-    name, _, joint = channel.rpartition("_")
-    return name in ("q", "theta_m") and system.joints[int(joint) - 1].kind == "revolute"
-
-
-def _is_length(system: System, channel: str) -> bool:
-    return not is_angle(system, channel) and not channel.startswith("e")  # Euler parameters have no unit
 
 
 def scaled(names: Sequence[str], factor: float) -> Callable[[tuple[str, ...], Array], Array]:
@@ -118,8 +110,7 @@ def _signs(positions: Sequence[str]) -> Iterator[MistakeHypothesis]:
 
 
 def _units(system: System, positions: Sequence[str]) -> Iterator[MistakeHypothesis]:
-    angles = [name for name in positions if is_angle(system, name)]
-    lengths = [name for name in positions if _is_length(system, name)]
+    angles, lengths = ([name for name in positions if channel_unit(system, name) == unit] for unit in ("rad", "m"))
     for name, text, factor, all_of, words in (
         ("degrees", "is in degrees in place of rad", DEGREE, angles, "all angles"),
         ("millimetres", "is in mm in place of m", 1e-3, lengths, "all lengths"),
