@@ -16,6 +16,7 @@ from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import corrected, deviations, improved, possible
 from sms_online.diagnosis.evidence import angle, basis, free_of, gain, threshold
 from sms_online.diagnosis.followed import FollowedMotion
+from sms_online.diagnosis.online_search import LateColumns
 from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.diagnosis.rows import SessionRows
@@ -178,6 +179,23 @@ def test_noise_of_a_phase_is_predicted_to_first_order(
     assert_allclose(np.mean(ratio, axis=0), 1.0, atol=0.05)
     assert np.all(np.std(ratio, axis=0) < 1.3 * np.sqrt(2.0 / 60.0))
     assert np.flatnonzero(predicted.any(axis=0)).tolist() == acts
+
+
+@pytest.mark.slow
+def test_a_model_is_made_once_for_all_noisy_copies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a session, and while one runs."""
+    _, rows = session()
+    built: list[int] = []
+    real = build_model
+    monkeypatch.setattr("sms_online.diagnosis.candidates.build_model", lambda system: built.append(1) or real(system))
+    effect = Effect(name="viscous_friction", where="joint_1")
+    for make in (CandidateColumns(rows, rows.model.system), LateColumns(rows, rows.model.system, 0)):
+        built.clear()
+        copies = [make.within(weak) for weak in rows.noisy()]
+        for each in (make, *copies):
+            each.of(effect)
+        assert len(built) == 1
+        assert all(type(copy) is type(make) for copy in copies)
 
 
 def test_a_gain_is_what_least_squares_takes_off_the_residual() -> None:

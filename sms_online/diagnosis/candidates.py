@@ -60,9 +60,12 @@ class CandidateColumns:
 
     def within(self, weak: WeakWindows, resting: bool = False) -> CandidateColumns:
         """The same for other windows of the session."""
-        other = CandidateColumns(self.rows, self.system, weak, resting=resting)
+        other = self._in(weak, resting)
         other._made = self._made
         return other
+
+    def _in(self, weak: WeakWindows, resting: bool) -> CandidateColumns:
+        return CandidateColumns(self.rows, self.system, weak, resting=resting)
 
     def _model(self, effect: Effect) -> Model:
         """The model with one more effect, the last one. What becomes a constant is linear only beside known masses."""

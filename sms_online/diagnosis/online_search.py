@@ -78,8 +78,7 @@ class LateColumns(CandidateColumns):
         self._late = late
         self._before = self._weak.windows.segment < late
 
-    def within(self, weak: WeakWindows, resting: bool = False) -> LateColumns:
-        """The same for other windows of the session."""
+    def _in(self, weak: WeakWindows, resting: bool) -> LateColumns:
         return LateColumns(self.rows, self.system, self._late, weak, resting)
 
     def of(self, effect: Effect) -> Candidate:
