@@ -281,7 +281,7 @@ class Changes(Stage):
                 for k, size in zip(shifted, explanation.sizes, strict=True)]  # fmt: skip
         again = np.zeros((len(shifted), m + n + 1))
         again[np.arange(len(shifted)), shifted] = [1.0 / each.tolerance for each in wide]
-        before = self._before(onset - MARGIN)
+        before = self._before(onset)
         known = self._known_at(before, (onset + alarm) // 2).without(shifted).with_rows(again)
         if (np.abs(explanation.sizes) >= LARGEST_SHIFT).any():
             known = self.beforehand.without(shifted).with_rows(again)
@@ -306,10 +306,11 @@ class Changes(Stage):
                 whole, by, explanation.beta, self.detector.seen(), self.state.index, x, signals, between,
                 self._half_hop, self._system.sample_rate,
             )  # fmt: skip
-        guard = GUARD * self._half_hop
-        first, last = (onset, alarm) if instant is None else (int(instant) - guard, int(np.ceil(instant)) + guard)
-        at = 0.5 * (first + last) if instant is None else instant
-        before = self._before(first - MARGIN)
+        until, last, at = onset, alarm, 0.5 * (onset + alarm)
+        if instant is not None:
+            guard = GUARD * self._half_hop
+            until, last, at = int(instant) - guard - MARGIN, int(np.ceil(instant)) + guard, instant
+        before = self._before(until)
         fresh = [base.parameters[k].name for k in columns if k >= n]
         if fresh:
             self.state.added += fresh
@@ -331,7 +332,7 @@ class Changes(Stage):
             units=tuple(self.base.parameters[k].unit for k in jumped),
             sizes=tuple(float(size) for size in explanation.sizes[: len(jumped)]),
             stds=tuple(float(std) for std in explanation.stds[: len(jumped)]),
-            dropped_windows=sum(first - MARGIN < seen.end <= reach for seen in self.detector.history),
+            dropped_windows=sum(until < seen.end <= reach for seen in self.detector.history),
         )
         self.state.events.append(event)
         self.detector = self._new_detector()
