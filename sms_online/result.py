@@ -15,6 +15,7 @@ from sms_online.description.parse import describe
 from sms_online.description.schema import System
 from sms_online.evaluation import NORMAL_95
 from sms_online.history import History, HistoryRecorder, reported_covariance
+from sms_online.model.base_parameters import BaseParameters
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.statistics import Method
 from sms_online.row_types import Residual, Residuals
@@ -298,19 +299,15 @@ def result_of(
     """
     now, base = evaluation.statistics, evaluation.base
     notices = evaluation.notices
-    true = np.full(base.n, np.nan)
-    if truth is not None:
-        missing = [p.name for p in base.physical if p.name not in truth]
-        if missing:
-            notices = [*notices, f"no comparison with the truth: it does not hold {missing[0]}"]
-        else:
-            true = base.values(np.array([truth[p.name] for p in base.physical]))
+    missing = [] if truth is None else [p.name for p in base.physical if p.name not in truth]
+    if missing:
+        notices = [*notices, f"no comparison with the truth: it does not hold {missing[0]}"]
     bounds = np.full(base.n, np.inf)
     if bound is not None:
         bounds[: bound.size] = bound
     estimate, projection = evaluation.estimate, evaluation.projection
     projected = np.full(base.n, np.nan) if projection is None or not projection.active else projection.beta
-    numbers = (estimate.pi, evaluation.std, evaluation.determined, true, bounds, projected)
+    numbers = (estimate.pi, evaluation.std, evaluation.determined, true_parameters(base, truth), bounds, projected)
     parameters = Parameters(
         Parameter(
             p.name,
@@ -351,6 +348,13 @@ def result_of(
         history=() if history is None else history.histories,
         covariance=reported_covariance(estimate, evaluation.std),
     )
+
+
+def true_parameters(base: BaseParameters, truth: Mapping[str, float] | None) -> Array:
+    """True values (n,) of base parameters, NaN unless `truth` holds that of each physical parameter by its name."""
+    if truth is None or not all(p.name in truth for p in base.physical):
+        return np.full(base.n, np.nan)
+    return base.values(np.array([truth[p.name] for p in base.physical]))
 
 
 def event_document(event: Event) -> dict[str, Any]:

@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 
 import sms_online as sms
+from sms_online.diagnosis.document import diagnosis_document
+from sms_online.result import result_of
+from sms_online.verdict.judged import evaluated
 from sms_tools.cli import main
 from sms_tools.exit_codes import INTERRUPTED
 from sms_tools.interruption import Interruption
@@ -44,6 +47,13 @@ def test_an_interrupted_search_reports_what_it_found() -> None:
     assert effect.coefficients["torque"].unit == "N m"
     assert "coulomb_friction" in [each.name for each in found.system.effects]
     assert not any(text.startswith("fitting the model with") for text in said)
+    # Parameters of its own rows are reported as those of a session, and compared with the truth.
+    truth = {p.name: p.nominal for p in found.search.model.parameters} | {f"{effect.effect}.torque": FRICTION}
+    entries = diagnosis_document(found.search, truth=truth)["after"]["parameters"]
+    whole = result_of(evaluated(found.search.estimator_before)).document()["parameters"]
+    assert all(entry.keys() == whole[0].keys() for entry in entries)
+    assert entries[-1]["true"] == FRICTION
+    assert all(entry["true"] is not None for entry in entries)
 
 
 @pytest.mark.slow

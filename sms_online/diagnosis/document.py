@@ -75,7 +75,9 @@ def diagnosis_document(
                 "fit": residual_document(_part(state.fit)),
                 "holdout": residual_document(_part(state.holdout)),
                 "limit": {row: test.limit for row, test in state.test.items()},
-                "parameters": posterior(attempt, chosen) if _from_rows(diagnosis) else results[name]["parameters"],
+                "parameters": [p.document() for p in posterior(attempt, chosen, truth)]
+                if given
+                else results[name]["parameters"],
             }
             for name, state, attempt, chosen in (
                 ("before", before, diagnosis.described, []),
@@ -119,7 +121,7 @@ def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
     trust = session.trust
     if _from_rows(diagnosis):
         # Parameters come from the rows of the diagnosis then, see `posterior`.
-        known = [p["identifiable"] for p in posterior(diagnosis.attempt, diagnosis.chosen)]
+        known = [p.determined for p in posterior(diagnosis.attempt, diagnosis.chosen)]
         trust = judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
     steps = [reason.then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE) for reason in trust.grounds]
     grounds = zip(trust.grounds, steps, strict=True)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -13,9 +12,11 @@ from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.reported import Coefficients, of_constant, of_unknowns
 from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.shape import slopes
-from sms_online.evaluation import NORMAL_95, identifiable
-from sms_online.model.parameters import Parameter
+from sms_online.evaluation import identifiable
+from sms_online.model.parameters import Parameter as ModelParameter
+from sms_online.result import Parameter, true_parameters
 from sms_online.stream import Array
+from sms_online.tables import finite
 
 
 def coefficients(diagnosis: Search, finding: Finding) -> Coefficients:
@@ -34,27 +35,22 @@ def coefficients(diagnosis: Search, finding: Finding) -> Coefficients:
     return {name: (value, shapes.get(name, std)) for name, (value, std) in reported.items()}
 
 
-def posterior(attempt: Attempt, chosen: Sequence[int]) -> list[dict[str, Any]]:
-    """Parameters as in results.json, from the rows of the diagnosis: these tolerate a prior where the model lacks much.
+def posterior(attempt: Attempt, chosen: Sequence[int], truth: Mapping[str, float] | None = None) -> list[Parameter]:
+    """Parameters from the rows of the diagnosis: these tolerate a prior where the model lacks much.
 
-    A session whitens rows by the sensors' noise alone until it knows better, and against that no prior counts.
+    A session whitens rows by the sensors' noise alone until it knows better, and against that no prior counts. truth:
+    as in `result_of`.
     """
     batch = _batch(attempt, chosen)
-    parameters, values, stds = batch.parameters, batch.values, np.sqrt(np.diag(batch.covariance))
+    values, stds = batch.values, np.sqrt(np.diag(batch.covariance))
+    base, known = attempt.rows.base, truth or {}
+    true = [*true_parameters(base, truth), *(known.get(p.name, np.nan) for p in batch.parameters[base.n :])]
+    columns = (values, stds, identifiable(values, stds), np.array(true))
     return [
-        {
-            "name": p.name,
-            "symbol": p.symbol,
-            "unit": p.unit,
-            "estimate": float(value),
-            "std": float(std) if np.isfinite(std) else None,
-            "lower95": float(value - NORMAL_95 * std) if np.isfinite(std) else None,
-            "upper95": float(value + NORMAL_95 * std) if np.isfinite(std) else None,
-            "nominal": p.nominal or None,
-            "true": None,
-            "identifiable": bool(known),
-        }
-        for p, value, std, known in zip(parameters, values, stds, identifiable(values, stds), strict=True)
+        Parameter(p.name, p.symbol, p.unit, value, std, determined, nominal=p.nominal or None, true=finite(true_value))
+        for p, value, std, determined, true_value in zip(
+            batch.parameters, *(column.tolist() for column in columns), strict=True
+        )
     ]
 
 
@@ -65,7 +61,7 @@ class _Batch:
     shapes: deviations of shape constants, by key of the effect and name; those of the others include their error.
     """
 
-    parameters: list[Parameter]
+    parameters: list[ModelParameter]
     values: Array
     covariance: Array
     shapes: dict[tuple[str, str], float]
