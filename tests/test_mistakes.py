@@ -269,3 +269,5 @@ def test_a_held_command_is_joined_where_it_changes() -> None:
     assert found.name == "held_command"
     joined = found.apply(("tau_1",), held[:, None])[:, 0]
     assert np.abs(joined - np.sin(3.0 * t))[:-20].max() < 1e-3
+    # A capture that was held out may have other channels.
+    np.testing.assert_array_equal(found.apply(("q_1",), held[:, None])[:, 0], held)

@@ -80,6 +80,21 @@ def scaled(names: Sequence[str], factor: float) -> Callable[[tuple[str, ...], Ar
     return apply
 
 
+def _per_channel(names: Sequence[str], change: Callable[[Array], Array]) -> Callable[[tuple[str, ...], Array], Array]:
+    """What changes the numbers of each of some channels."""
+
+    def apply(channels: tuple[str, ...], values: Array) -> Array:
+        out = values.copy()
+        for name in names:
+            if name in channels:
+                k = channels.index(name)
+                read = np.flatnonzero(np.isfinite(values[:, k]))
+                out[read, k] = change(values[read, k])
+        return out
+
+    return apply
+
+
 def _groups(names: Sequence[str]) -> dict[str, list[str]]:
     """Channels that one device gives: a link's markers, the base's position; every encoder is its own."""
     groups: dict[str, list[str]] = {}
@@ -208,18 +223,15 @@ def _other_encoder(name: str) -> str:
 
 def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Array]:
     """Whole turns that wrapping loses are those of the joint's other encoder."""
-    other = _other_encoder(name)
+    other, joined = _other_encoder(name), _per_channel([name], lambda column: np.unwrap(column, period=turn))
 
     def apply(channels: tuple[str, ...], values: Array) -> Array:
-        out = values.copy()
-        if name in channels:
+        out = joined(channels, values)
+        if name in channels and other in channels:
             k = channels.index(name)
-            read = np.flatnonzero(np.isfinite(values[:, k]))
-            out[read, k] = np.unwrap(values[read, k], period=turn)
-            if other in channels:
-                apart = out[:, k] - values[:, channels.index(other)]
-                known = apart[np.isfinite(apart)]
-                out[:, k] -= turn * np.round(np.median(known) / turn) if known.size else 0.0
+            apart = out[:, k] - values[:, channels.index(other)]
+            known = apart[np.isfinite(apart)]
+            out[:, k] -= turn * np.round(np.median(known) / turn) if known.size else 0.0
         return out
 
     return apply
@@ -237,7 +249,9 @@ def _stuck(
             said = f"{name} is stuck at one value for {count} samples while it moves before"
             step = f"check encoder and cable of {name}; leave that time out with -ss and -to"
             # The joint's other encoder moves meanwhile, if there is one.
-            yield MistakeHypothesis("stuck", name, said, step, _without_stuck(name), certain=bool(others))
+            yield MistakeHypothesis(
+                "stuck", name, said, step, _per_channel([name], _without_stuck), certain=bool(others)
+            )
 
 
 def _moves(when: Sequence[NDArray[np.bool_]], readings: Sequence[Array]) -> bool:
@@ -247,16 +261,8 @@ def _moves(when: Sequence[NDArray[np.bool_]], readings: Sequence[Array]) -> bool
     return not speed.shape[1] or bool(np.any(speed[then].mean(axis=0) > AT_REST * speed.mean(axis=0)))
 
 
-def _without_stuck(name: str) -> Callable[[tuple[str, ...], Array], Array]:
-    def apply(channels: tuple[str, ...], values: Array) -> Array:
-        out = values.copy()
-        if name in channels:
-            k = channels.index(name)
-            read = np.flatnonzero(np.isfinite(values[:, k]))
-            out[read[stuck_samples(values[read, k])], k] = np.nan
-        return out
-
-    return apply
+def _without_stuck(column: Array) -> Array:
+    return np.where(stuck_samples(column), np.nan, column)
 
 
 def without_gaps(segment: Segment) -> list[Segment]:
@@ -268,7 +274,7 @@ def without_gaps(segment: Segment) -> list[Segment]:
 
 
 def _held(drives: Sequence[str], channels: Sequence[str], segments: Sequence[Segment]) -> Iterator[MistakeHypothesis]:
-    """A command that is held between its updates, where it should act in the middle of each hold."""
+    """A command that is held between its updates: joined by lines from the start of each hold to the next."""
     lengths = {}
     for name in drives:
         k = list(channels).index(name)
@@ -285,20 +291,10 @@ def _held(drives: Sequence[str], channels: Sequence[str], segments: Sequence[Seg
         samples = ", ".join(str(each) for each in sorted(set(lengths.values())))
         said = f"{where} changes every {samples} samples only: a command that is held, no measured torque"
         step = f"record the measured torque or current for {where}"
-        yield MistakeHypothesis("held_command", where, said, step, _joined(lengths))
+        yield MistakeHypothesis("held_command", where, said, step, _per_channel(names, _joined))
 
 
-def _joined(lengths: dict[str, int]) -> Callable[[tuple[str, ...], Array], Array]:
-    """Straight lines between the held values, each at the middle of its hold."""
-
-    def apply(channels: tuple[str, ...], values: Array) -> Array:
-        out = values.copy()
-        for name in lengths:
-            k = channels.index(name)
-            read = np.flatnonzero(np.isfinite(values[:, k]))
-            column = values[read, k]
-            starts = np.concatenate(([0], np.flatnonzero(np.diff(column) != 0.0) + 1))
-            out[read, k] = np.interp(np.arange(column.size), starts, column[starts])
-        return out
-
-    return apply
+def _joined(column: Array) -> Array:
+    """Straight lines between the held values, each at the start of its hold."""
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(column) != 0.0) + 1))
+    return np.interp(np.arange(column.size), starts, column[starts])
