@@ -61,6 +61,8 @@ def notices(now: Statistics) -> list[str]:
         out.append(f"latency of {', '.join(late)} is described but not corrected by the smoother")
     if now.counters.gaps:
         out.append(f"{now.counters.gaps} gaps too long to bridge; each begins a new window of the balance")
+    if now.counters.duplicates:
+        out.append(f"{now.counters.duplicates} samples dropped: their channel had one at that instant already")
     if now.counters.interpolated_cells:
         out.append(f"{now.counters.interpolated_cells} cells interpolated")
     coloured = {} if now.momentum is None else now.momentum.coloured

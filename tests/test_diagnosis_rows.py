@@ -14,7 +14,7 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import corrected, deviations, improved, possible
-from sms_online.diagnosis.evidence import angle, basis, free_of, gain, threshold
+from sms_online.diagnosis.evidence import basis, free_of, gain, threshold
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.online_search import LateColumns
 from sms_online.diagnosis.record import SampleRecord, Segment, excerpts
@@ -30,6 +30,7 @@ from sms_online.row_types import row_types
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve
 from sms_sim.simulate import sampled_blocks, simulate
+from tests.campaigns.blind import angle
 from tests.evaluated import standard_deviation
 from tests.exactly_known import exactly_known
 

@@ -69,4 +69,6 @@ def test_parts_of_one_factorisation_solve_without_a_block(dependent: bool) -> No
         columns[:, 5] = columns[:, 4]
     columns[~left_out[2], 3] = 0.0
     expected = [least_squares(columns[~each], b[~each]) for each in left_out]
-    assert_allclose(least_squares_without(columns, b, list(left_out)), expected, rtol=1e-9, atol=1e-12)
+    assert_allclose(
+        least_squares_without(columns, b, list(left_out), np.zeros(6, dtype=bool)), expected, rtol=1e-9, atol=1e-12
+    )

@@ -30,13 +30,13 @@ class Correction(Stage):
         self._sensing, self._nuisances = sensing, nuisances
         self._families = position_families(sensing, sensing.model.system.tolerances)
         self._columns = sensing.position_columns
-        late = self._late(nuisances)
+        late = self._late()
         kernels = [ahead(seconds, sample_rate) for seconds in late.tolist()]
         self._kernels = {k: each for k, each, by in zip(self._columns, kernels, late, strict=True) if by != 0.0}
         self._margin = max((kernel.size // 2 for kernel in self._kernels.values()), default=0)
         self.state = CorrectionState(np.empty((0, 0)))
 
-    def _late(self, nuisances: Array) -> Array:
+    def _late(self) -> Array:
         """Lateness of each position sensor (sensors,), s."""
         layout, sensors = self._sensing.model.layout, len(self._columns)
         turned = np.broadcast_to(np.eye(3), (1, 3, 3))

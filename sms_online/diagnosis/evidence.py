@@ -113,11 +113,11 @@ def together(columns: Array, b: Array, prior: Prior | None) -> Array:
 
 
 def least_squares_without(
-    columns: Array, b: Array, left_out: Sequence[NDArray[np.bool_]], positive: NDArray[np.bool_] | None = None
+    columns: Array, b: Array, left_out: Sequence[NDArray[np.bool_]], positive: NDArray[np.bool_]
 ) -> Array:
     """Solutions (B, n) for columns (M, n) and b (M,) without each of some sets of rows (M,), from one factorisation.
 
-    positive (n,): which are not negative, none by default. Where columns are nearly dependent, or are so without a set,
+    positive (n,): which are not negative. Where columns are nearly dependent, or are so without a set,
     each is solved for itself. Source: the block form of leaving one out, Cook and Weisberg, Residuals and Influence in
     Regression, 1982, section 3.6.
     """
@@ -125,7 +125,6 @@ def least_squares_without(
     size[size == 0.0] = 1.0
     Q, R = np.linalg.qr(columns / size)
     n = columns.shape[1]
-    positive = np.zeros(n, dtype=bool) if positive is None else positive
     if len(columns) < n or not _well_conditioned(R):
         return np.array([fitted(columns[~each], b[~each], positive) for each in left_out])
     along = Q.T @ b
@@ -197,13 +196,6 @@ def _gain(scaled: Array, along: Array, left: Array, own: NDArray[np.int64], seen
     coefficients[seen] = root @ part
     covariance[np.ix_(seen, seen)] = root @ root.T
     return Gain(float(part @ part), coefficients, covariance, True)
-
-
-def angle(Q: Array, first: Array, second: Array) -> float:
-    """Smallest principal angle, rad, of two candidates' columns (M, ·) beside the model with basis Q."""
-    A, B = (basis(free_of(Q, columns)) for columns in (first, second))
-    cosine = np.linalg.svd(A.T @ B, compute_uv=False)[0]
-    return float(np.arccos(min(1.0, cosine)))
 
 
 @cache

@@ -32,12 +32,12 @@ class HeldOutRows(CandidateRows):
         out[:, free] = least_squares_without(columns[:, free], self._b, left_out, positive[free])
         return out
 
-    def predicted(
-        self, chosen: Sequence[int], solutions: Array | None = None, beside: Sequence[int] | None = None
-    ) -> Array:
-        """What is left of every row (W, n_v) over its own deviation, blocks predicted from the others."""
-        solutions = self.solutions(chosen, beside) if solutions is None else solutions
-        left = self.residual(chosen, self.solution(chosen, beside=beside))
+    def predicted(self, chosen: Sequence[int], solutions: Array) -> Array:
+        """What is left of every row (W, n_v) over its own deviation, blocks predicted from the others.
+
+        solutions: without each of the blocks.
+        """
+        left = self.residual(chosen, self.solution(chosen))
         for k, solution in enumerate(solutions):
             held = self.folds.predicted(k)
             left[held] = self.residual(chosen, solution)[held]

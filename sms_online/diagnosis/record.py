@@ -32,7 +32,6 @@ class SampleRecord(Observer):
     """Collects the grid samples of a session, up to LONGEST seconds of them."""
 
     def __init__(self, sample_rate: float) -> None:
-        self.sample_rate = sample_rate
         self._pieces: list[GridSamples] = []
         self._left = round(LONGEST * sample_rate)
 

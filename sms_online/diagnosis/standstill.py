@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import position
 from sms_online.pipeline.sensing import Sensing
-from sms_online.pipeline.standstill import Standstill, rate_filter, slowest
+from sms_online.pipeline.standstill import Standstill, rate_filter
 from sms_online.stream import Array
 
 # Before breakaway an axis is held by what its law gives so long before its motion shows, s.
@@ -21,7 +21,7 @@ LEAVING = 0.025
 class SessionStandstill:
     """Where one axis is at rest in a session.
 
-    axis: number of its speed. noise: σ of its position, rad. slow: the rate below which it is at rest, rad/s.
+    axis: number of its speed. noise: σ of its position, rad.
     """
 
     def __init__(
@@ -29,7 +29,6 @@ class SessionStandstill:
     ) -> None:
         layout = sensing.model.layout
         self.axis = axis
-        self.slow = slowest(noise, rate_filter(sample_rate), sample_rate)
         self._still, self._leaving = [], []
         for segment in segments:
             angle = position(layout, sensing.coordinates(segment.values), axis)
@@ -40,11 +39,11 @@ class SessionStandstill:
 
     @cached_property
     def share(self) -> float:
-        """Share of the session in which it does."""
+        """Share of the session in which the axis is at rest."""
         return float(np.mean(np.concatenate(self._still)))
 
     def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """At which samples (K,) of a segment it does."""
+        """At which samples (K,) of a segment the axis is at rest."""
         return self._still[number][samples]
 
     def leaving(self, number: int, samples: NDArray[np.int64]) -> Array:

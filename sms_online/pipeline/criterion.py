@@ -91,14 +91,12 @@ class Minimum:
     """The least value of the criterion, and how it rises from there.
 
     beta (n,): where it is. directions (n, rank): of unit curvature, those with information. slopes
-    (n_v, n): of each speed's part of it, which add up to what priors pull with. errors (n_v,): the share e that each
-    column is off by beyond noise.
+    (n_v, n): of each speed's part of it, which add up to what priors pull with.
     """
 
     beta: Array
     directions: Array
     slopes: Array
-    errors: Array
 
     @property
     def covariance(self) -> Array:
@@ -307,10 +305,9 @@ def minimum(
 def at_minimum(criterion: Criterion, w: Array, penalty: Penalty) -> Minimum:
     """What there is to know of the minimum at w (n + 1,)."""
     there = criterion.at(w)
-    errors = criterion.errors(there)
-    slopes, curvature, _ = criterion.slopes(there, errors)
+    slopes, curvature, _ = criterion.slopes(there, criterion.errors(there))
     directions = _basis(curvature[:-1, :-1] + penalty.derivatives(w)[1])
-    return Minimum(w[:-1], directions, slopes[:, :-1], np.sqrt(errors))
+    return Minimum(w[:-1], directions, slopes[:, :-1])
 
 
 def _basis(information: Array) -> Array:

@@ -87,4 +87,4 @@ class EnergyEstimate(Stage):
             self.tracker.update(Rows(rows.Y[finite], rows.b[finite], np.ones(t.size), t))
             now.newest_row = float(t[-1])
         after = index >= self._since
-        self._joints.push(index[after], x[after], v[after], signals[after])
+        self._joints.push(x[after], v[after], signals[after])

@@ -247,11 +247,6 @@ class Estimator(Stage):
         return self._setup[1]
 
     @property
-    def half_width(self) -> int:
-        """Half width M of the rates' filter, samples."""
-        return self._rates.half_width
-
-    @property
     def periods(self) -> Array:
         """Sample period of each channel, s, as found; NaN while it is not known."""
         return self._synchroniser.periods

@@ -111,7 +111,7 @@ class EventRows:
             prior = prior_rows(self.nuisances, base.n)
             known = partial(np.append, np.zeros(m), weights)
             fit = MomentumFit(
-                model, base, balance, new_noise, known, calibration=prior, drift=drift, point=self.point
+                model, base, balance, new_noise, known, prior, self.point, drift=drift
             )  # fmt: skip
             fit.go_on(weights, noise, before.misfit)
             white = fit.push(windows, instants, noise)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.channels import Motion
 from sms_online.calibration.joints import JointCalibration
@@ -117,7 +116,7 @@ class JointBalance(Stage):
         """Forget the samples before a gap."""
         self.state.samples, self.state.skip = self.state.samples[:0], 0
 
-    def push(self, index: NDArray[np.int64], x: Array, v: Array, signals: Array) -> None:
+    def push(self, x: Array, v: Array, signals: Array) -> None:
         """Add the rows of each window that the samples complete to the joints' residuals.
 
         signals (B, n_signals): see `Model.inputs`.

@@ -117,9 +117,8 @@ class Momentum(Stage):
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span, moments=self.bank.follows)
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(
-            model, base, self._balance, self._new_noise, self._solved, self._sources,
-            prior_rows(self.nuisances, base.n), self.joint.prior_information,
-            gain_columns(model, base, self.nuisances), self._drift_at, self.point,
+            model, base, self._balance, self._new_noise, self._solved, prior_rows(self.nuisances, base.n), self.point,
+            self._sources, self.joint.prior_information, gain_columns(model, base, self.nuisances), self._drift_at,
         )  # fmt: skip
         self.fit.plain.patient = self.state.patient and self.bank.patient
         self.test = self._new_test()

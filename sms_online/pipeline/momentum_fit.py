@@ -97,11 +97,10 @@ class MomentumFit(Stage):
     """Whitens the windows of a session, segment by segment.
 
     new_noise: makes what propagates noise, for the same model, base and balance. solve: gives the estimate so far of
-    nuisances and β (m + n,), which weights follow. sources: whose latencies are estimated. calibration: rows
-    [N Y b] (k, m + n + 1) of what is known of the nuisances beforehand. prior_information: gives all that is known
-    beside the rows. drift: gives the known drift in the window that ends at a grid index. point: gives the nuisances
-    (m,) that samples are corrected by, none by default. whitening: that of now. torque (n_v,): which speeds' rows hold
-    a torque.
+    nuisances and β (m + n,), which weights follow. calibration: rows [N Y b] (k, m + n + 1) of what is known of the
+    nuisances beforehand. point: gives the nuisances (m,) that samples are corrected by. sources: whose latencies are
+    estimated. prior_information: gives all that is known beside the rows. drift: gives the known drift in the window
+    that ends at a grid index. whitening: that of now. torque (n_v,): which speeds' rows hold a torque.
     """
 
     def __init__(
@@ -111,18 +110,17 @@ class MomentumFit(Stage):
         balance: MomentumBalance,
         new_noise: Callable[[], WindowNoise],
         solve: Callable[[], Array],
+        calibration: Array,
+        point: Callable[[], Array],
         sources: Sequence[SourceGroup] = (),
-        calibration: Array | None = None,
         prior_information: Callable[[], PriorInformation] | None = None,
         gains: Sequence[int] = (),
         drift: Callable[[int], DriftLine | None] = lambda end: None,
-        point: Callable[[], Array] | None = None,
     ) -> None:
         self.model = model
         self.base = base
-        self._calibration = np.zeros((0, base.n + 1)) if calibration is None else calibration
-        self._nuisances = self._calibration.shape[1] - base.n - 1
-        self._point = point if point is not None else lambda: np.zeros(self._nuisances)
+        self._calibration, self._point = calibration, point
+        self._nuisances = calibration.shape[1] - base.n - 1
         inertial = np.isin(
             np.arange(-self._nuisances, base.n), np.flatnonzero(np.isin(base.independent, model.inertial))
         )

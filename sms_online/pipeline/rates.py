@@ -161,7 +161,7 @@ class RatesState(State):
 class RatesStage(Stage):
     """Smoothed values and rates of all columns, behind the same lag of M samples.
 
-    The third window of `warm_up` samples in which the channels move throughout fixes M for good. Windows before it, at
+    The third window of WARM_UP samples in which the channels move throughout fixes M for good. Windows before it, at
     rest, with the onset of motion or its first jolt, get an M of their own: a choice made at rest would be blind to the
     motion to come. Until M is fixed samples wait for their window to fill; none is lost, except the first and last M of
     a segment, which have no full filter.
@@ -171,17 +171,11 @@ class RatesStage(Stage):
     noise, 1σ per sample, NaN where it is to be estimated.
     """
 
-    def __init__(self, sample_rate: float, deciding: Sequence[int], sigma: Array, warm_up: int = WARM_UP) -> None:
+    def __init__(self, sample_rate: float, deciding: Sequence[int], sigma: Array) -> None:
         self.sample_rate = sample_rate
         self._stated = sigma.copy()
         self._deciding = np.array(deciding, dtype=np.int64)
-        self._warm_up = warm_up
         self.state = RatesState(sigma.copy(), np.empty((0, sigma.size)))
-
-    @property
-    def half_width(self) -> int:
-        """Half width M of the filter, samples."""
-        return self.state.half_width
 
     @property
     def sigma(self) -> Array:
@@ -190,7 +184,7 @@ class RatesStage(Stage):
 
     @property
     def fixed(self) -> bool:
-        """Whether M (half_width) and the noise (sigma) are fixed for the rest of the capture."""
+        """Whether M and the noise (sigma) are fixed for the rest of the capture."""
         return self.state.moved >= MOVING_WINDOWS
 
     def push(self, samples: GridSamples) -> list[RateSamples]:
@@ -227,7 +221,7 @@ class RatesStage(Stage):
                 budget -= delivered[0].index.size
             elif self._window_is_full and (budget >= DECISION_COST or not pieces):
                 offset = self.state.decided - self.state.start
-                self._decide(self.state.buffer[offset : offset + self._warm_up])
+                self._decide(self.state.buffer[offset : offset + WARM_UP])
                 budget -= DECISION_COST
             else:
                 break
@@ -236,7 +230,7 @@ class RatesStage(Stage):
     @property
     def _window_is_full(self) -> bool:
         """Whether the samples that wait for M are enough to decide on it."""
-        return not self.fixed and self.state.start + self.state.buffer.shape[0] - self._warm_up >= self.state.decided
+        return not self.fixed and self.state.start + self.state.buffer.shape[0] - WARM_UP >= self.state.decided
 
     def _decide(self, window: Array) -> None:
         """One step towards M for a full window: first its noise, then M."""
@@ -247,7 +241,7 @@ class RatesStage(Stage):
         self._choose(window)
         self.state.noise_known = False
         self.state.moved += self._moves_throughout(window)
-        self.state.decided = NEVER if self.fixed else self.state.decided + self._warm_up
+        self.state.decided = NEVER if self.fixed else self.state.decided + WARM_UP
 
     def _estimate_noise(self, window: Array) -> None:
         estimate = np.isnan(self._stated)

@@ -47,13 +47,12 @@ KNOWN = 1e-6
 
 @dataclass(frozen=True)
 class Alarm:
-    """Rows leave more than noise: type of the row and its generalized speed, the one that leaves most.
+    """Rows leave more than noise: type of the row that leaves most.
 
     end: grid index of the last window behind it. since: grid index of the last window's end that showed nothing.
     """
 
     row: str
-    speed: str
     end: int
     since: int
 
@@ -125,8 +124,7 @@ class SequentialTest(Stage):
         now.since[turn] = np.where((sums == 0.0) | (before < 0), rows.end, before)
         worst = int(np.argmax(sums))
         if sums[worst] > self.limit:
-            row, speed = self._place(worst, turn)
-            self.state.alarm = Alarm(row, speed, rows.end, int(self.state.since[turn, worst]))
+            self.state.alarm = Alarm(self._row(worst), rows.end, int(self.state.since[turn, worst]))
 
     def _know(self, factor: Array) -> None:
         """Take β̂ from a factor; null holds the directions of which it knows nothing, columns scaled to unit length."""
@@ -166,14 +164,11 @@ class SequentialTest(Stage):
                 out[k] = _ratio(chi2, len(own))
         return out
 
-    def _place(self, test: int, turn: int) -> tuple[str, str]:
-        """Row type of a test, and the speed of it that leaves most."""
-        n_v = self._layout.n_v
-        types = row_types(self._layout)
-        row = next(name for name, speeds in types.items() if test in speeds) if test < n_v else ""
-        name = row or list(self._types)[test - n_v]
-        worst = max(types[name], key=lambda speed: self.state.sums[turn, speed])
-        return name, self._layout.speed_names[worst]
+    def _row(self, test: int) -> str:
+        """Row type of a test."""
+        if test >= self._layout.n_v:
+            return list(self._types)[test - self._layout.n_v]
+        return next(name for name, speeds in row_types(self._layout).items() if test in speeds)
 
     @property
     def evidence(self) -> dict[str, float]:

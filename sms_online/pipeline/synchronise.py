@@ -46,14 +46,12 @@ class GridSamples:
 class SyncCounters(State):
     """What happened to the samples so far.
 
-    samples: rows received. missing_cells: their cells without a value. duplicates: samples dropped because their
-    channel already had one at that instant. interpolated_cells: cells delivered by interpolation. gaps: breaks
-    between segments. lost_samples: grid points from the first sample to the last delivered one (after the flush: to
-    the last received) that were not delivered, in gaps or beside them, but for the pause before a resumption.
+    duplicates: samples dropped because their channel already had one at that instant. interpolated_cells: cells
+    delivered by interpolation. gaps: breaks between segments. lost_samples: grid points from the first sample to the
+    last delivered one (after the flush: to the last received) that were not delivered, in gaps or beside them, but for
+    the pause before a resumption.
     """
 
-    samples: int = 0
-    missing_cells: int = 0
     duplicates: int = 0
     interpolated_cells: int = 0
     gaps: int = 0
@@ -186,7 +184,6 @@ class Synchroniser(Stage):
     def _pass(self, time: Array, values: Array) -> list[GridSamples]:
         """The common case of `_advance`, 0.03 instead of 0.8 µs a sample: each row is its own grid point."""
         k = np.arange(self.state.next, self.state.next + time.size, dtype=np.int64)
-        self.state.counters.samples += time.size
         self.state.last_time = np.full(len(self.channels), time[-1])
         self.state.next += time.size
         self.state.time = np.concatenate([self.state.time[-SIDE:], time[-SIDE:]])[-SIDE:]
@@ -194,10 +191,8 @@ class Synchroniser(Stage):
         return self._deliver(k, values)
 
     def _admit(self, time: Array, values: Array) -> Array:
-        """Count, drop duplicates (as NaN), and learn the period of each channel from its first intervals."""
+        """Drop duplicates (as NaN), and count them, and learn the period of each channel from its first intervals."""
         missing = np.isnan(values)
-        self.state.counters.samples += time.size
-        self.state.counters.missing_cells += int(np.count_nonzero(missing))
         before = self.state.time[-1] if self.state.time.size else -np.inf
         apart = np.diff(time, prepend=before) > self._tolerance
         # Only among rows at one instant, the last ones before this block included, can a channel have two samples.

@@ -29,7 +29,7 @@ from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.diagnose import diagnose
-from sms_online.diagnosis.evidence import angle, basis
+from sms_online.diagnosis.evidence import basis, free_of
 from sms_online.diagnosis.posterior import coefficients
 from sms_online.diagnosis.search import Search
 from sms_online.effects.build import build_model
@@ -39,7 +39,7 @@ from sms_online.evaluation import Evaluation
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
-from sms_online.stream import Block
+from sms_online.stream import Array, Block
 from sms_tools.archive.runner import Work
 from tests.campaigns.accuracy import flagged
 from tests.campaigns.blind_draws import CLEAN, GRADE, SYSTEM, drawn
@@ -157,6 +157,13 @@ def _errors(system: System, session: Estimator) -> dict[str, float]:
     truth = dict(zip(names, true_parameters(system), strict=True))
     estimated = zip(session.base.parameters, session.estimate().pi, strict=True)
     return {p.name: float(value / truth[p.name] - 1.0) for p, value in estimated if p.name in truth}
+
+
+def angle(Q: Array, first: Array, second: Array) -> float:
+    """Smallest principal angle, rad, of two candidates' columns (M, ·) beside the model with basis Q."""
+    A, B = (basis(free_of(Q, columns)) for columns in (first, second))
+    cosine = np.linalg.svd(A.T @ B, compute_uv=False)[0]
+    return float(np.arccos(min(1.0, cosine)))
 
 
 def one_struck(folder: Path, name: str, seed: int) -> Record:
