@@ -158,7 +158,7 @@ class CalibrationColumns(Stage):
     def _kernel(self, offset: int, span: float) -> Array:
         """Weights (STEPS + 1, ·) of H, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x in the integral of c times what is added.
 
-        As `RowNoise.kernel`, but by splines: noise is known to a tenth, these are to be known to a thousandth.
+        As `RowNoise._kernel_weights`, but by splines: noise is known to a tenth, these are to be known to a thousandth.
         """
         phi, phi_dot, phi_ddot = (part[:, None] for part in test_function(STEPS, span, EXPONENT))
         every, some, per_second = np.arange(INSTANTS + 1), nodes(offset), INSTANTS / span

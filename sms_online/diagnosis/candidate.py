@@ -56,7 +56,7 @@ class Unmodelled:
     """Covariance of what the law of a candidate does not determine in the rows.
 
     own (W, n_v): variance by noise. free (W, HOPS, n_v): covariances by forces it does not give, where the rate's
-    sign changes, at a standstill, and where the rate is blurred. See `WeakWindows.free`.
+    sign changes, at a standstill, and where the rate is blurred. See `WeakWindows.shared`.
     """
 
     own: Array

@@ -41,7 +41,7 @@ class WeakRows:
     def whiten(self, own: Array, free: Array | None = None) -> None:
         """Make the windows' rows independent; own (W, n_v): further variance of each row, an error of its own.
 
-        free (W, HOPS, n_v): further covariances, see `WeakWindows.free`.
+        free (W, HOPS, n_v): further covariances, see `WeakWindows.shared`.
         """
         covariances = self._covariances
         if free is not None:

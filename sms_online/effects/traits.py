@@ -1,4 +1,4 @@
-"""What the rest of the program asks of an effect beside its law, so that no module asks for one by name."""
+"""What the rest of the program asks of an effect beside its law, so that only the catalogue asks for one by name."""
 
 from __future__ import annotations
 
