@@ -22,11 +22,7 @@ def with_exact_links(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Att
 
     All links together first, for one may hide what another lacks; then without those that take no more than chance.
     """
-    links = kinematic_candidates(attempt.system)
-    if not links:
-        return None
-
-    beta = attempt.rows.beta
+    links, beta = kinematic_candidates(attempt.system), attempt.rows.beta
     # What was found may be there beside it, or may only have mimicked it.
     effects = [attempt.tracing.candidates[k].effect for k in chosen]
 
