@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
-from sms_online.calibration.truncation import left
+from sms_online.calibration.truncation import share_variance
 from sms_online.effects.possible import not_negative
 from sms_online.model.parameters import Parameter
 from sms_online.nominal import NominalComparison, compare, unit_factors
@@ -100,7 +100,7 @@ class Evaluation:
 
     def _reported(self, estimate: Estimate) -> Array:
         """See `std`; of any tracker's estimate."""
-        return np.hypot(self._of_rows(estimate), np.sqrt(left(estimate, self.statistics.setup.nuisances)))
+        return np.hypot(self._of_rows(estimate), np.sqrt(share_variance(estimate, self.statistics.setup.nuisances)))
 
     def _of_rows(self, estimate: Estimate) -> Array:
         now = self.statistics

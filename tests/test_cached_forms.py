@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sms_online.diagnosis.quadratic_forms import QuadraticForms
+from sms_online.diagnosis.cached_forms import CachedForms
 from sms_online.stream import Array
 
 
@@ -17,7 +17,7 @@ def test_a_form_is_evaluated_at_unit_vectors_and_sums_alone() -> None:
         asked.append(coefficients)
         return np.asarray(np.sum((factors @ coefficients) ** 2, axis=1))
 
-    forms = QuadraticForms()
+    forms = CachedForms()
     for coefficients in rng.standard_normal((10, 3)):
         expected = np.sum((factors @ coefficients) ** 2, axis=1)
         np.testing.assert_allclose(forms.at("law", form, coefficients), expected, rtol=1e-12)

@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.stamp_jitter import Jitter, added, jitters, left_and_rates, noise_beside, none, pair_sums
+from sms_online.pipeline.stamp_jitter import Jitter, JitterState, jitters, left_and_rates, noise_beside, pair_sums
 from sms_online.stream import Array, Block
 from tests.evaluated import evaluated
 from tests.slow_encoder import GEAR, I_L, I_M, B, F, K, bench, session
@@ -33,7 +33,7 @@ def samples(random: np.random.Generator, jitter: float, wobble: float = 0.0) -> 
 
 
 def found(t: Array, values: Array) -> tuple[Jitter, ...]:
-    state = added(none(4), *pair_sums(*left_and_rates(values, t)), np.arange(4))
+    state = JitterState.none(4).with_sums(*pair_sums(*left_and_rates(values, t)), np.arange(4))
     return jitters(state, DEVICES, np.full(4, 1.0 / RATE))
 
 
@@ -77,7 +77,7 @@ def test_a_constant_channel_shows_no_jitter() -> None:
 
 def test_devices_of_one_clock_have_one_jitter() -> None:
     t, values = samples(np.random.default_rng(1), 3e-4)
-    state = added(none(4), *pair_sums(*left_and_rates(values, t)), np.arange(4))
+    state = JitterState.none(4).with_sums(*pair_sums(*left_and_rates(values, t)), np.arange(4))
     (jitter,) = jitters(state, [("motors", [0]), ("links", [1]), ("markers", [2, 3])], np.full(4, 1.0 / RATE))
     assert (jitter.name, jitter.sensors) == ("motors and links", (0, 1))
 

@@ -22,6 +22,7 @@ from sms_online.diagnosis.weak_windows import SeenMotion
 from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.pipeline.smoothing import smooth
+from sms_online.pipeline.standstill import rate_filter, slowest
 from tests.axis_effects import SYSTEM, axis_block, nothing
 from tests.sessions_of import session_of
 
@@ -123,7 +124,7 @@ def test_an_axis_is_at_rest_where_its_rate_is_noise_for_long(noise: float) -> No
     sensing: Any = SimpleNamespace(model=SimpleNamespace(layout=layout), coordinates=lambda values: values)
     held = SessionStandstill(sensing, [Segment(np.arange(t.size), position)], 0, noise, 1000.0)
     rested = smooth(position, np.arange(1150, 1550, 4), 28, 1000.0)[1]
-    assert held.slow == pytest.approx(4.0 * rested.std(), rel=0.35)
+    assert slowest(noise, rate_filter(1000.0), 1000.0) == pytest.approx(4.0 * rested.std(), rel=0.35)
     seen = np.arange(100, 2900)
     still = held.at(0, seen)
     edges = t[seen[np.flatnonzero(np.diff(still, prepend=False, append=False)[: still.size])]]

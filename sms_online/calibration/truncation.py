@@ -61,7 +61,7 @@ def truncations(system: System) -> Iterator[Nuisance]:
             yield Nuisance("truncation", f"link_{i}", "", tolerance)
 
 
-def left(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Array:
+def share_variance(estimate: Estimate, nuisances: Sequence[Nuisance]) -> Array:
     """Variance (n,) of π for what the shares may be off by beside their standard deviations.
 
     Noise in their columns draws shares together: of 0 they come out larger, of 1 smaller, and no link has one between.

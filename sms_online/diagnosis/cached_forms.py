@@ -9,7 +9,7 @@ import numpy as np
 from sms_online.stream import Array
 
 
-class QuadraticForms:
+class CachedForms:
     """Remembers forms by key: values at unit vectors and at sums of two determine a quadratic form."""
 
     def __init__(self) -> None:

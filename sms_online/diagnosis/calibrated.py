@@ -27,7 +27,7 @@ LIMIT = 2.5
 HELD = 1e-6
 
 
-def sayable(system: System) -> frozenset[str]:
+def covered(system: System) -> frozenset[str]:
     """Tolerances that effects of the catalogue say in a system: where a parameter is known, not what is relative."""
     entries = (each for each in ENTRIES.values() if system.scale_tolerance is not None or not each.relative_to)
     return frozenset(name for entry in entries for name in entry.traits.calibrates if places(system, entry.at))
@@ -37,13 +37,13 @@ def sayable(system: System) -> frozenset[str]:
 class Calibrated:
     """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is whitened.
 
-    sayable: see that function. multiplied: what they and gains of torques multiply, with rows of synthetic noise
+    covered: see that function. multiplied: what they and gains of torques multiply, with rows of synthetic noise
     (W, n_v, ·) of each, see `MultipliedNoise`.
     """
 
     nuisances: tuple[Nuisance, ...]
     columns: Array
-    sayable: frozenset[str]
+    covered: frozenset[str]
     multiplied: tuple[Multiplied, ...]
     synthetic: Array
 
@@ -57,7 +57,7 @@ class Calibrated:
         moved = tuple(
             each if each.column is None else replace(each, column=known.index(each.column)) for each in multiplied
         )
-        return cls(tuple(nuisances[k] for k in known), columns[..., known], sayable(system), moved, synthetic)
+        return cls(tuple(nuisances[k] for k in known), columns[..., known], covered(system), moved, synthetic)
 
     @classmethod
     def none(cls, rows: Array) -> Calibrated:
@@ -79,14 +79,14 @@ class Calibrated:
         """Rows (m, m) of unit variance of what is known of them; held (m,): those at zero."""
         return np.diag(1.0 / (self.tolerance * np.where(held, HELD, 1.0)))
 
-    def said_by(self, effects: Iterable[Effect]) -> NDArray[np.bool_]:
+    def replaced_by(self, effects: Iterable[Effect]) -> NDArray[np.bool_]:
         """Which of them (m,) the effects replace: an effect in the model leaves no second unknown for the same."""
         effects = list(effects)
         return np.array([any(_replaces(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
 
     def beyond(self, values: Array) -> NDArray[np.bool_]:
         """Which of them (m,) an effect of the catalogue has to replace, for estimates (m,)."""
-        said = np.array([each.name in self.sayable for each in self.nuisances], dtype=np.bool_)
+        said = np.array([each.name in self.covered for each in self.nuisances], dtype=np.bool_)
         return np.asarray(said & (np.abs(values) > LIMIT * self.tolerance))
 
     def released(
@@ -97,7 +97,7 @@ class Calibrated:
         rows (M, n + m + 1): all columns, theirs last, and the right-hand side, without what is known of them. fitted:
         solves columns and a right-hand side.
         """
-        m, held = self.count, self.said_by(effects)
+        m, held = self.count, self.replaced_by(effects)
         # Only what is known of them changes: all other rows are reduced once.
         others, known = np.linalg.qr(rows, mode="r"), np.zeros((m, rows.shape[1]))
         while True:

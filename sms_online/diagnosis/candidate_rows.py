@@ -85,7 +85,7 @@ class CandidateRows(CandidateFits):
         # Covariance of what the laws of the chosen effects do not determine.
         self._own, self._free = np.zeros_like(rows.std), np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
-        self._loud: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
+        self._exceeding: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
         # Mean square that everything together left of the rows, and with which deviations.
         self._explained = 0.0, rows.std
         self._scale.begin()
@@ -115,8 +115,8 @@ class CandidateRows(CandidateFits):
         if self._laws is None:
             return False
         own, free = self._unmodelled(self._laws, chosen, solution)
-        if self._loud[0] == frozenset(chosen):
-            own[:, self._loud[1]], free[..., self._loud[1]] = 0.0, 0.0
+        if self._exceeding[0] == frozenset(chosen):
+            own[:, self._exceeding[1]], free[..., self._exceeding[1]] = 0.0, 0.0
         used, wanted = self._own + self._free[:, 0], own + free[:, 0]
         moved = tuple(chosen) != self._beside
         self._beside = tuple(chosen)
@@ -130,10 +130,10 @@ class CandidateRows(CandidateFits):
         self._whiten()
         # Rows that leave more than noise even so are uncertain by that: what the laws do not determine there would grow
         # with their coefficients, and these with it.
-        loud = (self.floor > 0.0) & np.any(wanted, axis=0)
-        if np.any(loud):
-            own[:, loud], free[..., loud] = 0.0, 0.0
-            self._loud = frozenset(chosen), loud
+        exceeding = (self.floor > 0.0) & np.any(wanted, axis=0)
+        if np.any(exceeding):
+            own[:, exceeding], free[..., exceeding] = 0.0, 0.0
+            self._exceeding = frozenset(chosen), exceeding
             self._whiten()
         return True
 
@@ -149,7 +149,7 @@ class CandidateRows(CandidateFits):
             at += c
         return own, free
 
-    def stays_loud(self, chosen: Sequence[int], k: int) -> bool:
+    def stays_exceeding(self, chosen: Sequence[int], k: int) -> bool:
         """Whether rows that a candidate acts on clearly leave more than noise with those chosen, this one last.
 
         By what everything together leaves of them with the variance that they would have then, see `_floor`.

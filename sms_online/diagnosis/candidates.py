@@ -12,10 +12,10 @@ import numpy as np
 
 from sms_online.description.schema import Effect, System
 from sms_online.description.tree import index_of
+from sms_online.diagnosis.cached_forms import CachedForms
 from sms_online.diagnosis.candidate import Candidate, Unmodelled
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.followed import FollowedMotion
-from sms_online.diagnosis.quadratic_forms import QuadraticForms
 from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
@@ -53,7 +53,7 @@ class CandidateColumns:
         self._weak = rows.weak if weak is None else weak
         self._noisy: list[CandidateColumns] = []
         self._made: dict[tuple[object, ...], Model] = {}
-        self._forms = QuadraticForms()
+        self._forms = CachedForms()
         self._held: dict[int, SessionStandstill] = {}
         self._turned: dict[int, Reversals] = {}
         self._own = {p.name for p in rows.model.parameters}
@@ -276,7 +276,7 @@ class CandidateColumns:
             v = motion.v.copy()
             v[:, held.axis] = MOVING_OFF
             still, leaving = (each(motion.segment, motion.samples)[:, None] for each in (held.at, held.leaving))
-            times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.alike)
+            times = np.where(leaving != 0.0, leaving_for * WINDING**2, self._weak.effective_samples)
             return np.where(still, times * along(v) ** 2, jumps)
 
         return self._weak.squares(squares)

@@ -10,7 +10,7 @@ import numpy as np
 from sms_online.calibration.found import Calibration
 from sms_online.description.schema import System
 from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, Part, PriorOf, Progress
-from sms_online.diagnosis.calibrated import sayable
+from sms_online.diagnosis.calibrated import covered
 from sms_online.diagnosis.captures import begins, in_seconds, one_after_another, undone
 from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, leaves_unexplained, may_explain
 from sms_online.diagnosis.exact_links import with_exact_links
@@ -245,7 +245,7 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
 def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
     """Errors of a session's description beyond its tolerances that no effect of the catalogue covers."""
     every = evaluated(session).calibration
-    return tuple(each for each in every if each.beyond and each.name not in sayable(session.system))
+    return tuple(each for each in every if each.beyond and each.name not in covered(session.system))
 
 
 def _check_balanced(session: Estimator, source: str) -> None:

@@ -11,7 +11,7 @@ from sms_online.verdict.evidence import Discrepancy
 
 
 @dataclass(frozen=True)
-class Evidence:
+class SearchAnswer:
     """The answer of a search: of samples up to `time`, s, known when samples up to `known`, s, were there."""
 
     time: float
@@ -41,7 +41,7 @@ class Episode:
     refused: str | None = None
     event: Event | None = None
     drifting: tuple[str, ...] = ()
-    evidence: list[Evidence] = field(default_factory=list)
+    evidence: list[SearchAnswer] = field(default_factory=list)
 
 
 def line(episode: Episode) -> str:

@@ -130,7 +130,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Correction:
+class ConstantsStep:
     """One improvement of constants: its hypothesis, its solution (n + c,), and the constants improved."""
 
     hypothesis: Hypothesis
@@ -155,7 +155,7 @@ class Correction:
 
 def corrections(
     trial: Callable[[Sequence[Effect], Array], Hypothesis], constants: Sequence[Effect], beta: Array
-) -> Iterator[Correction]:
+) -> Iterator[ConstantsStep]:
     """Constants improved, each time with samples free of those found before.
 
     trial: makes the hypothesis of constants, rows whitened with beta (n,); its candidates are all chosen.
@@ -165,7 +165,7 @@ def corrections(
         some.tracing.reweight(some.everything)
         solution = some.solution(some.everything)
         constants, beta = some.improved(solution), solution[: beta.size]
-        yield Correction(some, solution, list(constants))
+        yield ConstantsStep(some, solution, list(constants))
 
 
 def share_left(before: float, after: float) -> float:

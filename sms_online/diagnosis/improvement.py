@@ -13,7 +13,7 @@ from sms_online.diagnosis.attempt import SEARCHED, Attempt, Case, ModelFit, Prog
 from sms_online.diagnosis.candidate import Finding
 from sms_online.diagnosis.constants import possible
 from sms_online.diagnosis.folds import LEAST_RISE
-from sms_online.diagnosis.hypothesis import Correction, corrections
+from sms_online.diagnosis.hypothesis import ConstantsStep, corrections
 from sms_online.diagnosis.trace import DECISIVE
 from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Array
@@ -63,7 +63,7 @@ def with_constants(
     return attempt, chosen, findings
 
 
-def _improved(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Correction:
+def _improved(case: Case, attempt: Attempt, chosen: Sequence[int]) -> ConstantsStep:
     """The constants among those chosen, beside those that samples are corrected by already, improved together."""
     solution = attempt.solution(chosen)
     fresh, forces = attempt.found(chosen, solution)
@@ -74,7 +74,7 @@ def _improved(case: Case, attempt: Attempt, chosen: Sequence[int]) -> Correction
     return correction
 
 
-def _distinguished(case: Case, attempt: Attempt, chosen: list[int]) -> tuple[list[int], Correction, set[str]]:
+def _distinguished(case: Case, attempt: Attempt, chosen: list[int]) -> tuple[list[int], ConstantsStep, set[str]]:
     """Those chosen, with a rival in the place of a constant where samples that it corrects leave clearly less; the
     improved constants; and keys of those that leave clearly more than the ones in their place.
 

@@ -20,8 +20,7 @@ from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.evidence import threshold
 from sms_online.diagnosis.record import Segment
-from sms_online.diagnosis.rough_fit import HOPS as ROUGH_HOPS
-from sms_online.diagnosis.rough_fit import RoughRows, stretches
+from sms_online.diagnosis.rough_fit import HALVES, RoughRows, stretches
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.effects.catalogue import lag_places
 from sms_online.effects.delay import HELD, LONGEST_FOUND, delay_of, lag, lagging, late_keys
@@ -121,7 +120,7 @@ class Lags:
             return np.full(1, np.inf)
         part = np.arange(rough.count) * BLOCKS // rough.count % PARTS
         shares = [rough.shares(part != k) for k in range(PARTS)]
-        self._independent = rough.count // ROUGH_HOPS
+        self._independent = rough.count // HALVES
         return np.asarray(np.log(np.clip(np.sqrt(np.mean(np.square(shares), axis=0)), TINY, 1.0)))
 
     def gains(self, before: Array, after: Array) -> Array:

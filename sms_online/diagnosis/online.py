@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.episodes import Episode, Evidence, discrepancy, episode_document, line
+from sms_online.diagnosis.episodes import Episode, SearchAnswer, discrepancy, episode_document, line
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import Segment, joined
 from sms_online.diagnosis.searcher import Named, Outcome, Request, Searcher
@@ -145,7 +145,7 @@ class OnlineDiagnosis(Observer):
         if done is not None and self._pending is not None and done[0] == self._pending[0]:
             time, self._pending = self._pending[1], None
             if done[1] is not None and self._onset is not None:
-                self._hear(Evidence(time, self._now, done[1]))
+                self._take_answer(SearchAnswer(time, self._now, done[1]))
         self._withdraw()
         self._notice()
         self._search()
@@ -304,7 +304,7 @@ class OnlineDiagnosis(Observer):
                 out.append(Segment(each.index[inside], each.values[inside]))
         return out
 
-    def _hear(self, evidence: Evidence) -> None:
+    def _take_answer(self, evidence: SearchAnswer) -> None:
         """Take the answer of a search."""
         episode, outcome = self.episodes[-1], evidence.outcome
         before = episode.evidence[-1].outcome if episode.evidence else None
@@ -344,7 +344,7 @@ class OnlineDiagnosis(Observer):
         """Name for good what two searches agree on, and adopt it if wanted."""
         self._sure, episode = True, self.episodes[-1]
         if self._adopt:
-            self._take_up(episode, episode.evidence[-1].outcome)
+            self._adopt_named(episode, episode.evidence[-1].outcome)
             self.on_verdict(self._now, line(episode))
 
     def _close_settled(self) -> None:
@@ -356,7 +356,7 @@ class OnlineDiagnosis(Observer):
         self._quiet = episode.adopted is None or adopted == MOST_ADOPTED
         self._close()
 
-    def _take_up(self, episode: Episode, outcome: Outcome) -> None:
+    def _adopt_named(self, episode: Episode, outcome: Outcome) -> None:
         """Go on with what was named."""
         onset, estimator = self._onset, self._estimator
         assert onset is not None

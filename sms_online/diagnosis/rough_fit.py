@@ -27,7 +27,7 @@ from sms_online.pipeline.smoothing import HALF_WIDTHS, stride
 from sms_online.stream import Array
 
 # Windows overlap by half.
-HOPS = 2
+HALVES = 2
 # Half filters in a window.
 FILTERS = 20
 # Rows of which nominal values make less than this share of the largest are of no motion.
@@ -59,7 +59,7 @@ def stretches(session: Estimator | SessionRows, segments: Sequence[Segment]) -> 
     """Parts of a session that suffice for a rough fit."""
     system, rate = session.model.system, session.model.system.sample_rate
     windows = WANTED_ROWS * (session.base.n + LAWS * len(system.joints)) / session.model.layout.n_v
-    duration = max(SOME, STRETCH * np.ceil(windows * system.windows.momentum / HOPS / STRETCH))
+    duration = max(SOME, STRETCH * np.ceil(windows * system.windows.momentum / HALVES / STRETCH))
     return excerpts(segments, round(STRETCH * rate), round(duration * rate))
 
 
@@ -76,7 +76,7 @@ class RoughRows:
         width = round(model.system.windows.momentum * rate)
         M = max((HALF_WIDTHS[0], *(half for half in HALF_WIDTHS if FILTERS * half <= width)))
         starts = [
-            np.arange(M, each.index.size - M - width - 1, max(1, width // HOPS), dtype=np.int64) for each in segments
+            np.arange(M, each.index.size - M - width - 1, max(1, width // HALVES), dtype=np.int64) for each in segments
         ]
         self.count = count = sum(each.size for each in starts)
         if 2 * base.n > count * layout.n_v:

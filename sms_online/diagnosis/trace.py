@@ -252,7 +252,7 @@ class Tracing(Acceptance):
         those chosen; where rows that it acts on leave more than noise whatever is added, any large variance at rest
         would make them likelier, and the deviance is infinite.
         """
-        if acting is not None and self.stays_loud(chosen, acting):
+        if acting is not None and self.stays_exceeding(chosen, acting):
             return np.inf
         self._iterated(chosen)
         if acting is not None and np.any(self.floor[self._acts(acting)]):

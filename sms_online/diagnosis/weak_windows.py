@@ -16,7 +16,7 @@ from sms_online.pipeline.momentum_windows import HOPS, INSTANTS
 from sms_online.pipeline.row_noise import common
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import kernel, smooth, smooth_all
-from sms_online.pipeline.weak_form import alike, test_function
+from sms_online.pipeline.weak_form import effective_samples, test_function
 from sms_online.stream import Array
 
 
@@ -104,9 +104,9 @@ class WeakWindows:
         return SeenMotion(number, M, seen, x, v, smoothed[:, n_x:]), which
 
     @property
-    def alike(self) -> float:
-        """Samples that a window averages over, see `weak_form.alike`."""
-        return alike(test_function(self.windows.width, 1.0, self.windows.exponent)[0])
+    def effective_samples(self) -> float:
+        """Samples that a window averages over, see `weak_form.effective_samples`."""
+        return effective_samples(test_function(self.windows.width, 1.0, self.windows.exponent)[0])
 
     def columns(self, weak: WeakColumns, dense: bool = False) -> Array:
         """Rows (W, n_v, c).

@@ -18,7 +18,7 @@ from sms_online.effects.base import STANDSTILL, joints_of
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.pipeline.smoothing import kernel
-from sms_online.pipeline.weak_form import alike
+from sms_online.pipeline.weak_form import effective_samples
 from sms_online.stream import Array
 
 # Step of the differences that give slopes, rad and rad/s (m, m/s): 1e-9 of a force is lost to curvature where a phase
@@ -151,7 +151,7 @@ def stiction_std(breaking: Array, still: NDArray[np.bool_], phi: Array) -> Array
     `RoughForces.breaking` along the window. still (width + 1, D): whether the axis rests. phi (width + 1,): weights of
     the integral.
     """
-    inside = alike(phi) * (phi[:, None] * breaking * still) ** 2
+    inside = effective_samples(phi) * (phi[:, None] * breaking * still) ** 2
     half_hops = np.arange(0, phi.size - 1, (phi.size - 1) // INSTANTS)
     return np.asarray(np.sqrt(np.add.reduceat(inside[:-1], half_hops)))
 

@@ -16,12 +16,10 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.stamp_jitter import (
     Jitter,
     JitterState,
-    added,
     by_sensor,
     jitters,
     left_and_rates,
     noise_beside,
-    none,
     pair_sums,
 )
 from sms_online.state import Stage, State
@@ -99,7 +97,7 @@ class NoiseEstimate(Stage):
         reference = reference_clock(sensing)
         own = [] if reference is None else [(reference.name, list(reference.sensors))]
         self._devices = [*own, *((name, sensors) for (name, _), sensors in other_clocks(sensing).items())]
-        jitter = none(len(sensing.position_columns))
+        jitter = JitterState.none(len(sensing.position_columns))
         self.state = NoiseEstimateState(
             [np.empty((2, 0)) for _ in range(count)], np.zeros(count), jitter, np.zeros((count, 3))
         )
@@ -197,7 +195,7 @@ class NoiseEstimate(Stage):
             samples = np.stack([self.state.samples[k][1] for k in together], axis=1)
             left, rates = left_and_rates(samples, self.state.samples[together[0]][0])
             own = np.flatnonzero(np.isin(positions, together))
-            self.state.jitter = added(self.state.jitter, *pair_sums(left, rates), own)
+            self.state.jitter = self.state.jitter.with_sums(*pair_sums(left, rates), own)
             parts |= {k: (left[:, c], rates[:, c]) for c, k in enumerate(together)}
         found = jitters(self.state.jitter, self._devices, period[positions])
         for jitter in found:

@@ -54,6 +54,19 @@ class JitterState(State):
     product: Array
     rates: Array
 
+    @staticmethod
+    def none(sensors: int) -> JitterState:
+        """Nothing known of so many sensors."""
+        return JitterState(np.zeros((sensors, sensors)), np.zeros((sensors, sensors)))
+
+    def with_sums(self, product: Array, rates: Array, own: NDArray[np.int64]) -> JitterState:
+        """With sums of some sensors (indices), by which older samples of these count less."""
+        pairs = np.ix_(own, own)
+        out = JitterState(self.product.copy(), self.rates.copy())
+        out.product[pairs] = KEPT * out.product[pairs] + product
+        out.rates[pairs] = KEPT * out.rates[pairs] + rates
+        return out
+
 
 def left_and_rates(samples: Array, times: Array) -> tuple[Array, Array]:
     """What differencing leaves of samples (B, C) at times (B,), s, in units of one sample's noise, and the rates."""
@@ -130,20 +143,6 @@ def noise_beside(left: Array, rates: Array, jitter: float) -> float:
         weight = (variance + of_jitter) ** -2.0
         variance = max(float(np.sum(weight * (left**2 - of_jitter)) / np.sum(weight)), np.finfo(np.float64).tiny)
     return float(np.sqrt(variance))
-
-
-def none(sensors: int) -> JitterState:
-    """Nothing known of so many sensors."""
-    return JitterState(np.zeros((sensors, sensors)), np.zeros((sensors, sensors)))
-
-
-def added(before: JitterState, product: Array, rates: Array, own: NDArray[np.int64]) -> JitterState:
-    """With sums of some sensors (indices), by which older samples of these count less."""
-    pairs = np.ix_(own, own)
-    out = JitterState(before.product.copy(), before.rates.copy())
-    out.product[pairs] = KEPT * out.product[pairs] + product
-    out.rates[pairs] = KEPT * out.rates[pairs] + rates
-    return out
 
 
 def by_sensor(found: Sequence[Jitter], sensors: int, sample_rate: float) -> Array:

@@ -66,7 +66,7 @@ class Standstill(Stage):
         self.state.still = np.stack([lasting(slow, self._rate) for slow in (np.abs(rates) < limits).T], axis=1)
 
     def at(self, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether they do at samples (K,), (K, D); what is not known yet is as what is known last."""
+        """Whether the axes are at rest at samples (K,), (K, D); what is not known yet is as what is known last."""
         now = self.state
         if not len(now.still):
             return np.zeros((samples.size, now.still.shape[1]), dtype=bool)

@@ -10,7 +10,7 @@ import numpy as np
 from sms_online.stream import Array
 
 
-def alike(phi: Array) -> float:
+def effective_samples(phi: Array) -> float:
     """Samples of φ (K,) that an integral with it averages over, (Σ φ)² / Σ φ².
 
     Of a force that is another at each sample with so many times the variance it is as large as of one that stays.
