@@ -140,7 +140,7 @@ class TorqueDelay(Convolved):
 
     @property
     def latency(self) -> float:
-        """d, s."""
+        """By how much the reading is later than the torque acts, s."""
         return self.coefficients["time"]
 
     def acts_on(self, channel: str) -> bool:
@@ -149,13 +149,13 @@ class TorqueDelay(Convolved):
         return kind in ("tau", "force") and fnmatchcase(f"joint_{joint}", self.where)
 
     def distort(self, samples: Array, sample_rate: float) -> Array:
-        """τ(t - d), the first sample before the record."""
+        """The torque so much earlier; the first or the last sample beyond the record."""
         seconds = np.arange(samples.size) / sample_rate
-        return np.asarray(np.interp(seconds - self.coefficients["time"], seconds, samples))
+        return np.asarray(np.interp(seconds - self.latency, seconds, samples))
 
     def kernel(self, sample_rate: float) -> Array:
-        """Weights (2M + 1,) of the samples about an instant in the value d later."""
-        return ahead(self.coefficients["time"], sample_rate)
+        """Weights (2M + 1,) of the samples about an instant in the value so much later."""
+        return ahead(self.latency, sample_rate)
 
     @classmethod
     def improved(cls, given: Mapping[str, float], increments: Array) -> dict[str, float]:
@@ -186,17 +186,8 @@ class ActuatorDelay(TorqueDelay):
 
     @property
     def latency(self) -> float:
-        """-d, s."""
+        """See `TorqueDelay`: the reading is earlier."""
         return -self.coefficients["time"]
-
-    def distort(self, samples: Array, sample_rate: float) -> Array:
-        """τ(t + d), the last sample behind the record."""
-        seconds = np.arange(samples.size) / sample_rate
-        return np.asarray(np.interp(seconds + self.coefficients["time"], seconds, samples))
-
-    def kernel(self, sample_rate: float) -> Array:
-        """Weights (2M + 1,) of the samples about an instant in the value d earlier."""
-        return ahead(-self.coefficients["time"], sample_rate)
 
 
 class SensorLatency(Convolved):

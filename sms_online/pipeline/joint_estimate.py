@@ -105,19 +105,13 @@ class JointEstimate(Stage):
         squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
         return self._unbiased(squares) if scale_free is None else scale_free.estimate(squares)
 
-    def solved(self, fit: MomentumFit) -> Estimate:
-        """The same without what only error bars take, for weights that follow the estimate."""
-        return self._solved(fit)
+    def solved(self, fit: MomentumFit, lost_unknown: bool = False) -> Estimate:
+        """The same without what only error bars take.
 
-    def for_weights(self, fit: MomentumFit) -> Estimate:
-        """The same, with nothing known along directions whose information noise makes.
-
-        Least squares attenuate there. Weights that followed would predict less noise, so that the next estimate is
-        attenuated further and looks better determined.
+        lost_unknown: whether nothing is known along directions whose information noise makes. Least squares attenuate
+        there: weights that followed would predict less noise, so that the next estimate is attenuated further and looks
+        better determined.
         """
-        return self._solved(fit, lost_unknown=True)
-
-    def _solved(self, fit: MomentumFit, lost_unknown: bool = False) -> Estimate:
         squares, scale_free = self.tracker.estimate(), self.scale_free(fit)
         return self._unbiased(squares, lost_unknown) if scale_free is None else scale_free.solved(squares)
 

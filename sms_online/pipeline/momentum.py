@@ -230,7 +230,7 @@ class Momentum(Stage):
 
     def _solved(self) -> Array:
         """Nuisances and β, of the rows and, where these determine little, of the description."""
-        solved = self.joint.for_weights(self.fit).without_nuisances(len(self.nuisances))
+        solved = self.joint.solved(self.fit, lost_unknown=True).without_nuisances(len(self.nuisances))
         return nearer(solved, *self.fit.described)
 
     def push(self, piece: GridSamples, noise: SensorNoise, start_time: float) -> None:
