@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
 from sms_online.calibration.channels import Motion, position_families
 from sms_online.effects.delay import ahead
+from sms_online.pipeline.convolution import Convolution
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.state import Stage, State
 from sms_online.stream import Array
 
 # What is added follows the corrected readings; from one pass to the next the rest shrinks as errors of scale are small.
 PASSES = 2
 
 
-class CorrectionState(State):
-    """What a correction keeps: values (B, C), the last samples of a segment, which the next ones ask for."""
-
-    values: Array
-    segment: int = -1
-
-
-class Correction(Stage):
+class Correction(Convolution):
     """Corrects the position sensors' channels by nuisances (m,); all others pass, as much later as clocks ask for."""
 
     def __init__(self, sensing: Sensing, sample_rate: float, nuisances: Array) -> None:
@@ -32,9 +24,7 @@ class Correction(Stage):
         self._columns = sensing.position_columns
         late = self._late()
         kernels = [ahead(seconds, sample_rate) for seconds in late.tolist()]
-        self._kernels = {k: each for k, each, by in zip(self._columns, kernels, late, strict=True) if by != 0.0}
-        self._margin = max((kernel.size // 2 for kernel in self._kernels.values()), default=0)
-        self.state = CorrectionState(np.empty((0, 0)))
+        super().__init__({k: each for k, each, by in zip(self._columns, kernels, late, strict=True) if by != 0.0})
 
     def _late(self) -> Array:
         """Lateness of each position sensor (sensors,), s."""
@@ -55,24 +45,9 @@ class Correction(Stage):
 
     def push(self, piece: GridSamples) -> list[GridSamples]:
         """The samples that can be corrected by now."""
-        if not self._nuisances.any():
-            return [piece]
-        if piece.segment != self.state.segment:
-            self.state.segment, self.state.values = piece.segment, piece.values[:0]
-        values = np.concatenate((self.state.values, piece.values))
-        self.state.values = values[max(0, len(values) - 2 * self._margin) :]
-        inner = slice(self._margin, len(values) - self._margin)
-        if inner.stop <= inner.start:
-            return []
-        corrected = values[inner].copy()
-        for column, kernel in self._kernels.items():
-            corrected[:, column] = correlate1d(values[:, column], kernel, mode="nearest")[inner]
-        self._take_off(corrected)
-        last = int(piece.index[-1]) - self._margin
-        return [GridSamples(np.arange(last + 1 - len(corrected), last + 1, dtype=np.int64), corrected, piece.segment)]
+        return super().push(piece) if self._nuisances.any() else [piece]
 
-    def _take_off(self, values: Array) -> None:
-        """Everything but lateness."""
+    def _correct(self, values: Array) -> None:
         read, layout = values[:, self._columns], self._sensing.model.layout
         torque = np.zeros((len(values), len(layout.q)))
         for _ in range(PASSES):

@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
 from sms_online.description.schema import System
 from sms_online.effects.catalogue import corrections
 from sms_online.effects.channel import Convolved
-from sms_online.pipeline.synchronise import GridSamples
-from sms_online.state import Stage, State
+from sms_online.pipeline.convolution import Convolution
 from sms_online.stream import Array
 
 
@@ -43,17 +41,7 @@ def noise_gains(system: System, channels: Sequence[str]) -> Array:
     return gains
 
 
-class ConditioningState(State):
-    """What conditioning keeps.
-
-    values (B, C): last samples of a segment, which the next ones ask for.
-    """
-
-    values: Array
-    segment: int = -1
-
-
-class Conditioning(Stage):
+class Conditioning(Convolution):
     """Corrects the channels of one session by the constants that its system file states.
 
     Lags and delays come off first, for they act on what the sensor reads. InputError as `channel_effects`.
@@ -62,26 +50,9 @@ class Conditioning(Stage):
     def __init__(self, system: System, channels: tuple[str, ...]) -> None:
         self._sample_rate = system.sample_rate
         effects = [(k, e) for e in corrections(system) for k, channel in enumerate(channels) if e.acts_on(channel)]
-        self._kernels = channel_kernels(system, channels)
         self._of_value = [(k, effect) for k, effect in effects if not isinstance(effect, Convolved)]
-        self.margin = max((kernel.size // 2 for kernel in self._kernels.values()), default=0)
-        self.state = ConditioningState(np.empty((0, len(channels))))
+        super().__init__(channel_kernels(system, channels))
 
-    def push(self, piece: GridSamples) -> list[GridSamples]:
-        """The samples that can be corrected by now."""
-        if piece.segment != self.state.segment:
-            self.state.segment = piece.segment
-            self.state.values = self.state.values[:0]
-        values = np.concatenate((self.state.values, piece.values))
-        self.state.values = values[max(0, len(values) - 2 * self.margin) :]
-        inner = slice(self.margin, len(values) - self.margin)
-        if inner.stop <= inner.start:
-            return []
-        corrected = values[inner].copy()
-        for column, kernel in self._kernels.items():
-            corrected[:, column] = correlate1d(values[:, column], kernel, mode="nearest")[inner]
+    def _correct(self, values: Array) -> None:
         for column, effect in reversed(self._of_value):
-            corrected[:, column] = effect.correct(corrected[:, column], self._sample_rate)
-        last = int(piece.index[-1]) - self.margin
-        index = np.arange(last + 1 - len(corrected), last + 1, dtype=np.int64)
-        return [GridSamples(index, corrected, piece.segment)]
+            values[:, column] = effect.correct(values[:, column], self._sample_rate)
