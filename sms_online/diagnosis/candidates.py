@@ -20,7 +20,7 @@ from sms_online.diagnosis.reversals import Reversals
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.standstill import LEAVING, SessionStandstill
 from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows
-from sms_online.effects.base import Ranges, joints_of, position
+from sms_online.effects.base import Ranges, deflection, joints_of, position
 from sms_online.effects.build import build_model, declaring
 from sms_online.effects.catalogue import ENTRIES, LINEAR, candidates, curve_variables, periods, places, traits_of
 from sms_online.model.effect import Inputs
@@ -70,12 +70,12 @@ class CandidateColumns:
     def _model(self, effect: Effect) -> Model:
         """The model with one more effect, the last one. What becomes a constant is linear only beside known masses."""
         if is_constant(effect):
-            return build_model(self._declaring(effect), self.rows.base.physical_values(self.rows.beta))
+            return build_model(declaring(self.system, [effect]), self.rows.base.physical_values(self.rows.beta))
         law = _law(effect)
         if law not in self._made:
             if len(self._made) == KEPT:
                 del self._made[next(iter(self._made))]
-            self._made[law] = build_model(self._declaring(effect))
+            self._made[law] = build_model(declaring(self.system, [effect]))
         return self._made[law]
 
     def inputs(self, motion: SeenMotion) -> Inputs:
@@ -139,11 +139,10 @@ class CandidateColumns:
     def _variables(self, effect: Effect) -> dict[str, Array]:
         """Values (K,) that the variables of a joint's curves go through, by name."""
         layout, i = self.rows.model.layout, index_of(effect.where)
-        motor, link = layout.theta_m[i], layout.q[i]
+        motor = layout.theta_m[i]
         x, v = (np.concatenate([getattr(m, part) for m, _ in self.rows.weak.motions()]) for part in ("x", "v"))
-        deflection = position(layout, x, motor) - position(layout, x, link)
-        values = {"rate": v[:, motor], "angle": position(layout, x, motor), "deflection": deflection}
-        values["load"] = deflection
+        bent = deflection(layout, x, i)
+        values = {"rate": v[:, motor], "angle": position(layout, x, motor), "deflection": bent, "load": bent}
         return {over: values[over] for over in curve_variables(self.system, effect)}
 
     def _turns(self, where: str, order: float) -> bool:
@@ -163,10 +162,10 @@ class CandidateColumns:
         angles = [motion.x[:, theta_m + layout.offset] for motion in motions]
         swing = float(np.ptp(np.concatenate(angles), axis=0).max())
         pairs = zip(angles, motions, strict=True)
-        deflection = max(float(np.abs(angle - motion.x[:, q + layout.offset]).max()) for angle, motion in pairs)
+        largest = max(float(np.abs(angle - motion.x[:, q + layout.offset]).max()) for angle, motion in pairs)
         rate = self.system.sample_rate
         longest = max(segment.index.size for segment in self.rows.segments[self._since :])
-        return Ranges(speed, swing, deflection, longest / rate, rate)
+        return Ranges(speed, swing, largest, longest / rate, rate)
 
     def of(self, effect: Effect) -> Candidate:
         """The candidate of one declaration."""
@@ -338,10 +337,6 @@ class CandidateColumns:
     def _noise_of(self, axis: int) -> float:
         """σ of the position of an axis, rad."""
         return float(position(self.rows.model.layout, self.rows.noise.coordinates[None], axis)[0])
-
-    def _declaring(self, effect: Effect) -> System:
-        """The system with one more effect."""
-        return declaring(self.system, [effect])
 
     def _torque_rate(self, where: str) -> Array:
         """∫ φ d(n τ)/dt dt of the joints that `where` matches, in their motors' rows (W, n_v), by way of dφ/dt."""

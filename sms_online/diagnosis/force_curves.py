@@ -20,7 +20,7 @@ from sms_online.diagnosis.evidence import basis, free_of, gain
 from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.splines import DEGREE, Variable, design, spline_columns
 from sms_online.diagnosis.weak_windows import SeenMotion
-from sms_online.effects.base import position
+from sms_online.effects.base import deflection, position
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import periods
 from sms_online.effects.traits import Curve
@@ -115,14 +115,14 @@ def _variable(attempt: Attempt, i: int, name: str, order: float) -> Variable:
     """A variable of joint i (from 0); order: periods of a phase in a motor turn."""
     model = attempt.rows.model
     layout, gear = model.layout, model.system.joints[i].gear_ratio
-    motor, link = layout.theta_m[i], layout.q[i]
+    motor = layout.theta_m[i]
 
     def values(motion: SeenMotion) -> Array:
         match name:
             case "motor speed":
                 return motion.v[:, motor]
             case "deflection":
-                return position(layout, motion.x, motor) - position(layout, motion.x, link)
+                return deflection(layout, motion.x, i)
             case "motor angle":
                 return position(layout, motion.x, motor)
             case "torque":

@@ -212,6 +212,11 @@ def position(layout: Layout, x: Array, speed: int) -> Array:
     return np.asarray(x[:, speed + layout.offset])
 
 
+def deflection(layout: Layout, x: Array, i: int) -> Array:
+    """θ_m - q (B,) of the joint with index i."""
+    return np.asarray(position(layout, x, layout.theta_m[i]) - position(layout, x, layout.q[i]))
+
+
 def report(
     effect: ForceEffect, names: Sequence[str], values: Array, covariance: Array
 ) -> dict[str, tuple[float, float]]:

@@ -39,9 +39,10 @@ class Cogging(MotorSide):
         {"order": Shape("", 6.0, lambda ranges: ORDERS, counted=True)},
         traits=Traits(signed=True, curve=Curve("phase in the motor's turn")),
     )  # fmt: skip
+    symbol, unit = "g", "N m"
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, nominal_parts("g", site.index, "N m", given), {"order": given["order"]})
+        super().__init__(site, nominal_parts(self.symbol, site.index, self.unit, given), {"order": given["order"]})
         self.gear_ratio = site.gear_ratio
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
@@ -54,7 +55,7 @@ class Cogging(MotorSide):
         return amplitude_and_phase(values) | dict(self.shapes)
 
 
-class TorqueRipple(MotorSide):
+class TorqueRipple(Cogging):
     """f = a n τ cos(p n θ_m - φ): the torque constant varies with the rotor's angle, `order` p times a motor turn.
 
     a: `amplitude`, a ratio; φ: `phase`, rad; linear in π are a cos φ and a sin φ.
@@ -67,22 +68,13 @@ class TorqueRipple(MotorSide):
         {"order": Shape("", 6.0, lambda ranges: ORDERS, counted=True)},
         traits=Traits(signed=True, least=LEAST_RATIO, most=LARGEST_RATIO),
     )  # fmt: skip
+    symbol, unit = "w", ""
     needs_torque = True
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, nominal_parts("w", site.index, "", given), {"order": given["order"]})
-        self.gear_ratio = site.gear_ratio
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """n τ times cos and sin of p n θ_m."""
         assert inputs is not None
-        theta_m = position(layout, x, layout.theta_m[self.index - 1])
-        columns = phase_columns(self.shapes["order"] * self.gear_ratio * theta_m)
-        return np.asarray(inputs.torque[:, self.index - 1, None] * columns)
-
-    def reported(self, values: Array) -> dict[str, float]:
-        """a and φ."""
-        return amplitude_and_phase(values) | dict(self.shapes)
+        return np.asarray(inputs.torque[:, self.index - 1, None] * super().along(layout, x, v, inputs))
 
 
 class TorqueOffset(MotorSide):

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sms_online.description.channels import has_motor_side
-from sms_online.effects.base import STANDSTILL, Entry, Force, Ranges, Shape, Site, dahl_rate, position
+from sms_online.effects.base import STANDSTILL, Entry, Force, Ranges, Shape, Site, dahl_rate, deflection
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
@@ -168,13 +168,12 @@ class LoadFriction(MotorSide):
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-|δ| sign(θ̇_m) or -|n τ| sign(θ̇_m)."""
-        motor, link = layout.theta_m[self.index - 1], layout.q[self.index - 1]
         if self.needs_torque:
             assert inputs is not None
             load = inputs.torque[:, self.index - 1]
         else:
-            load = position(layout, x, motor) - position(layout, x, link)
-        return -(np.abs(load) * sign(v[:, motor]))[:, None]
+            load = deflection(layout, x, self.index - 1)
+        return -(np.abs(load) * sign(v[:, layout.theta_m[self.index - 1]]))[:, None]
 
     def reported(self, values: Array) -> dict[str, float]:
         """c, which behind a spring is c k / k."""

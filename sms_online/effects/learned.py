@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import eigh, null_space
 
 from sms_online.description.schema import Effect, Over
-from sms_online.effects.base import Entry, Force, Site, position
+from sms_online.effects.base import Entry, Force, Site, deflection, position
 from sms_online.effects.friction import sign
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
@@ -118,13 +118,13 @@ class LearnedForce(Force):
 
     def variable(self, layout: Layout, x: Array, v: Array) -> Array:
         """What the curve is over, (B,)."""
-        motor, link = layout.theta_m[self.index - 1], layout.q[self.index - 1]
+        motor = layout.theta_m[self.index - 1]
         if self.over == "rate":
             return np.abs(v[:, motor])
         if self.over == "angle":
             return position(layout, x, motor)
-        deflection = position(layout, x, motor) - position(layout, x, link)
-        return np.abs(deflection) if self.over == "load" else deflection
+        bent = deflection(layout, x, self.index - 1)
+        return np.abs(bent) if self.over == "load" else bent
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """The modes, with the sign of a friction where it is one."""

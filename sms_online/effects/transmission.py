@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, dahl_rate, position
+from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, dahl_rate, deflection, position
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
@@ -34,11 +34,6 @@ class Transmission(Force):
         f[:, layout.theta_m[self.index - 1]] = self.along(layout, x, v, inputs)
         f[:, layout.q[self.index - 1]] = -f[:, layout.theta_m[self.index - 1]]
         return f
-
-    def deflection(self, layout: Layout, x: Array) -> Array:
-        """δ (B,)."""
-        i = self.index - 1
-        return np.asarray(position(layout, x, layout.theta_m[i]) - position(layout, x, layout.q[i]))
 
 
 def _widths(ranges: Ranges) -> tuple[float, ...]:
@@ -90,7 +85,7 @@ class CubicStiffness(Transmission):
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-δ³."""
-        return -(self.deflection(layout, x) ** 3)[:, None]
+        return -(deflection(layout, x, self.index - 1) ** 3)[:, None]
 
 
 class Backlash(Transmission):
@@ -116,7 +111,7 @@ class Backlash(Transmission):
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """clip(δ, -gap, gap)."""
         gap = self.shapes["gap"]
-        return np.clip(self.deflection(layout, x), -gap, gap)[:, None]
+        return np.clip(deflection(layout, x, self.index - 1), -gap, gap)[:, None]
 
     def reported(self, values: Array) -> dict[str, float]:
         """The gap where all of the joint's stiffness k is lost inside: that spring gives k gap less beyond it.
