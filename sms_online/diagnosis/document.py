@@ -134,7 +134,7 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
     after: the evaluation of the session with what was found, where it is at hand.
     """
     after = evaluated(diagnosis.estimator_after) if after is None else after
-    effects = [f"{effect['name']}@{effect['where']}" for effect in _named(diagnosis)]
+    effects = [effect.key for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest, learned = _after(diagnosis, after), diagnosis.attempt.case.learned
     if _undecided_yet(diagnosis):
@@ -234,14 +234,20 @@ def _times(value: float) -> str:
     return f"{value:.3g}" if value < 1000.0 else f"{value:,.0f}"
 
 
-def _named(diagnosis: Search) -> list[dict[str, str]]:
-    found = [{"name": f.candidate.effect.name, "where": f.candidate.effect.where} for f in diagnosis.findings]
-    return [{"name": each["name"], "where": each["where"]} for each in _by_comparison(diagnosis)] + found
+def _named(diagnosis: Search) -> list[Effect]:
+    found = [finding.candidate.effect for finding in diagnosis.findings]
+    return [*(each.effect for each in diagnosis.late), *_exact(diagnosis), *found]
 
 
-def _named_in_words(diagnosis: Search, named: Mapping[str, str]) -> str:
-    other = either(Effect(name=named["name"], where=named["where"]), diagnosis.after.system)
-    return f"{named['name']} at {named['where']}" + (f" or {other}" if other else "")
+def _exact(diagnosis: Search) -> list[Effect]:
+    """Kinematics of links that were found by comparing whole descriptions."""
+    known = [*diagnosis.described.system.effects, *(found.effect for found in diagnosis.late)]
+    return [effect for effect in diagnosis.attempt.system.effects if effect not in known]
+
+
+def _named_in_words(diagnosis: Search, named: Effect) -> str:
+    other = either(named, diagnosis.after.system)
+    return f"{named.name} at {named.where}" + (f" or {other}" if other else "")
 
 
 def _part(part: Part) -> dict[str, Residual]:
@@ -250,27 +256,37 @@ def _part(part: Part) -> dict[str, Residual]:
 
 def _effect(diagnosis: Search, finding: Finding) -> dict[str, Any]:
     effect = finding.candidate.effect
-    entry, found = ENTRIES[effect.name], coefficients(diagnosis, finding)
-    units = declarable(entry, diagnosis.after.system)
+    found, units = coefficients(diagnosis, finding), declarable(ENTRIES[effect.name], diagnosis.after.system)
     other = either(effect, diagnosis.after.system)
     alike = [*([f"{effect.name}@{other}"] if other else []), *finding.ambiguous]
     units |= {p.quantity: p.unit for p in finding.candidate.parameters if p.quantity in units}
-    return {
-        "name": effect.name,
-        "where": effect.where,
-        "coefficients": {
-            name: {"estimate": value, "std": std, "unit": units.get(name, "")} for name, (value, std) in found.items()
-        },
-        "sentence": _said(diagnosis, effect, found),
-        "ambiguous_with": alike,
-        "separated_by": entry.separated_by if alike else None,
-        "evidence": {
+    rival = finding.rival
+    return _entry(
+        effect,
+        {name: {"estimate": value, "std": std, "unit": units.get(name, "")} for name, (value, std) in found.items()},
+        _said(diagnosis, effect, found),
+        alike,
+        {
             "gain": finding.gain.gain,
             "limit": finding.limit,
             "held_out_improvement": finding.improvement,
-            "next": None if finding.rival is None else finding.rival.key,
-            "next_held_out_improvement": None if finding.rival is None else finding.rival.improvement,
+            "next": None if rival is None else rival.key,
+            "next_held_out_improvement": None if rival is None else rival.improvement,
         },
+    )
+
+
+def _entry(
+    effect: Effect, coefficients: dict[str, Any], sentence: str, ambiguous: Sequence[str], evidence: dict[str, Any]
+) -> dict[str, Any]:
+    return {
+        "name": effect.name,
+        "where": effect.where,
+        "coefficients": coefficients,
+        "sentence": sentence,
+        "ambiguous_with": list(ambiguous),
+        "separated_by": ENTRIES[effect.name].separated_by if ambiguous else None,
+        "evidence": evidence,
     }
 
 
@@ -306,41 +322,15 @@ def _undecided(diagnosis: Search) -> list[Reason]:
 def _by_comparison(diagnosis: Search) -> list[dict[str, Any]]:
     """Effects that replace all rows, found by comparing whole descriptions: late sensors, kinematics of links."""
     late = [
-        {
-            "name": found.effect.name,
-            "where": found.effect.where,
-            "coefficients": {
-                "corner": {"estimate": found.effect.coefficients["corner"], "std": found.std, "unit": "Hz"}
-            },
-            "sentence": "",
-            "ambiguous_with": list(found.ambiguous),
-            "separated_by": ENTRIES[found.effect.name].separated_by if found.ambiguous else None,
-            "evidence": {
-                "gain": found.gain,
-                "limit": found.limit,
-                "held_out_improvement": found.improvement,
-                **NO_RIVAL,
-            },
-        }
+        _entry(
+            found.effect,
+            {"corner": {"estimate": found.effect.coefficients["corner"], "std": found.std, "unit": "Hz"}},
+            "",
+            found.ambiguous,
+            {"gain": found.gain, "limit": found.limit, "held_out_improvement": found.improvement, **NO_RIVAL},
+        )
         for found in diagnosis.late
     ]
-    known = [*diagnosis.described.system.effects, *(found.effect for found in diagnosis.late)]
-    kinematics: list[dict[str, Any]] = [
-        {
-            "name": effect.name,
-            "where": effect.where,
-            "coefficients": {},
-            "sentence": "",
-            "ambiguous_with": [],
-            "separated_by": None,
-            "evidence": {
-                "gain": diagnosis.before.excess * (1.0 - diagnosis.left),
-                "limit": 0.0,
-                "held_out_improvement": None,
-                **NO_RIVAL,
-            },
-        }
-        for effect in diagnosis.attempt.system.effects
-        if effect not in known
-    ]
-    return [*late, *kinematics]
+    gain = diagnosis.before.excess * (1.0 - diagnosis.left)
+    evidence = {"gain": gain, "limit": 0.0, "held_out_improvement": None, **NO_RIVAL}
+    return [*late, *(_entry(effect, {}, "", (), evidence) for effect in _exact(diagnosis))]
