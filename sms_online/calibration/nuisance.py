@@ -41,10 +41,7 @@ class Nuisance:
 
 def known_beforehand(nuisances: Sequence[Nuisance], n: int) -> Information:
     """Zero within their tolerances, as information on them and then on n parameters, of which nothing is known."""
-    return _information(prior_rows(nuisances, n))
-
-
-def _information(rows: Array) -> Information:
+    rows = prior_rows(nuisances, n)
     if not len(rows):
         return Information.none(rows.shape[1] - 1)
     return Information(triangular_factor(rows), len(rows))

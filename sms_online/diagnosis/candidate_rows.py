@@ -102,10 +102,14 @@ class CandidateRows(CandidateFits):
             return
         if self._weighed != ():
             self._begin()
+        self._iterated(chosen)
+        self._weighed = tuple(chosen)
+
+    def _iterated(self, chosen: Sequence[int]) -> None:
+        """Reweight the rows for those chosen until the weights are those of their coefficients."""
         for _ in range(ROUNDS):
             if not self.reweight(chosen):
                 break
-        self._weighed = tuple(chosen)
 
     def reweight(self, chosen: Sequence[int], solution: Array | None = None) -> bool:
         """Whiten the rows with what the laws of the chosen effects do not determine too; whether the weights change.

@@ -235,12 +235,6 @@ class Tracing(Acceptance):
             self.reweight(chosen)
         return law if decisive else None
 
-    def _iterated(self, chosen: Sequence[int]) -> None:
-        """Reweight the rows for those chosen until the weights are those of their coefficients."""
-        for _ in range(ROUNDS):
-            if not self.reweight(chosen):
-                break
-
     def _holds(self, k: int) -> bool:
         candidate = self.candidates[k]
         return self._laws is not None and candidate.traits.dry and self._laws.at_rest(candidate) > MUCH_REST
