@@ -91,7 +91,7 @@ def geometries(system: System) -> Iterator[Geometry]:
         if tolerances.length == 0.0:
             break
         if isinstance(link, FlexibleLink):
-            yield Geometry(Nuisance("length", f"link_{i + 1}", "m", tolerances.length), _longer(i))
+            yield Geometry(Nuisance("length", f"link_{i + 1}", "m", tolerances.length), partial(_longer, i))
         elif i in tree.parents or (i == tree.last and system.payload is not None):
             for axis in range(2 if planar else 3):
                 nuisance = Nuisance("length", f"link_{i + 1}", "m", tolerances.length, AXES[axis])
@@ -112,7 +112,9 @@ def geometries(system: System) -> Iterator[Geometry]:
     gravity = np.array(system.gravity)
     if gravity.any() and tolerances.gravity > 0.0:
         for part, about in _tilts(gravity, planar):
-            yield Geometry(Nuisance("gravity", "base", "rad", tolerances.gravity, part), _tilted(about, planar))
+            yield Geometry(
+                Nuisance("gravity", "base", "rad", tolerances.gravity, part), partial(_tilted, about, planar)
+            )
 
 
 def _with(records: tuple[object, ...], i: int, **changed: object) -> tuple[object, ...]:
@@ -120,13 +122,10 @@ def _with(records: tuple[object, ...], i: int, **changed: object) -> tuple[objec
     return (*records[:i], record, *records[i + 1 :])
 
 
-def _longer(i: int) -> Callable[[System, float], System]:
-    def moved(system: System, by: float) -> System:
-        link = system.links[i]
-        assert isinstance(link, FlexibleLink)
-        return system.model_copy(update={"links": _with(system.links, i, length=link.length + by)})
-
-    return moved
+def _longer(i: int, system: System, by: float) -> System:
+    link = system.links[i]
+    assert isinstance(link, FlexibleLink)
+    return system.model_copy(update={"links": _with(system.links, i, length=link.length + by)})
 
 
 def _displaced(records: str, i: int, point: str, axis: int, system: System, by: float) -> System:
@@ -159,14 +158,11 @@ def _across(gravity: Array) -> float:
     return float(np.sqrt(max(LEAST_GRAVITY**2 - float(gravity @ gravity), 0.0)))
 
 
-def _tilted(about: Array, planar: bool) -> Callable[[System, float], System]:
-    def moved(system: System, by: float) -> System:
-        gravity = np.array(system.gravity)
-        if planar:
-            gravity[2] = -_across(gravity)
-        turned = Rotation.from_rotvec(by * about).apply(gravity)
-        if planar:
-            turned[2] = 0.0
-        return system.model_copy(update={"gravity": tuple(turned.tolist())})
-
-    return moved
+def _tilted(about: Array, planar: bool, system: System, by: float) -> System:
+    gravity = np.array(system.gravity)
+    if planar:
+        gravity[2] = -_across(gravity)
+    turned = Rotation.from_rotvec(by * about).apply(gravity)
+    if planar:
+        turned[2] = 0.0
+    return system.model_copy(update={"gravity": tuple(turned.tolist())})

@@ -16,12 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, STEPS
+from sms_online.pipeline.momentum_windows import EXPONENT, STEPS, STEPS_A_HOP
 from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-STEPS_A_HOP = STEPS // HOPS
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 11
 

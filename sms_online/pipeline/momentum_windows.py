@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sms_online.pipeline.weak_form import test_function
+from sms_online.pipeline.weak_form import effective_samples, test_function
 from sms_online.stream import Array
 
 # Exponent of φ = (1 - z²)⁶: smooth enough that sums over samples are integrals and that two derivatives of φ, which
@@ -16,7 +16,7 @@ HOPS = 10  # a window begins every tenth of a window
 def _overlap() -> float:
     """How many windows share one error that each row has of its own, hop by hop, as test functions overlap."""
     phi, _, _ = test_function(100 * HOPS, 1.0, EXPONENT)
-    return float(phi.sum() ** 2 / (phi @ phi) / 100.0)
+    return effective_samples(phi) / 100.0
 
 
 # Windows whose rows are not whitened among themselves: so many of them count as one.
@@ -25,6 +25,7 @@ OVERLAP = _overlap()
 INSTANTS = 2 * HOPS
 # Steps of a window at which it is known what noise adds to its rows: two for each instant.
 STEPS = 2 * INSTANTS
+STEPS_A_HOP = STEPS // HOPS
 # Copies of motion and torques: as measured, and with synthetic noise added and subtracted.
 COPIES = 3
 

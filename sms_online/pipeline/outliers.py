@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.pipeline.noise import NORMAL_MAD
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
@@ -34,8 +35,6 @@ PASSES = 4
 PATIENCE = 0.1
 # Deviations of a channel follow its samples with this memory, in samples; before there are so many, none is judged.
 MEMORY, FEWEST = 400.0, 20
-# Median absolute value of a unit normal distribution.
-NORMAL_MEDIAN = 0.674489750196082
 
 
 class LeftOut(NamedTuple):
@@ -133,7 +132,7 @@ class Outliers(Stage):
         if np.median(np.diff(t)) > PATIENCE / SIDE:
             return
         off = _off(t, samples)
-        median = np.median(np.abs(off[own]), axis=0) / NORMAL_MEDIAN
+        median = np.median(np.abs(off[own]), axis=0) / NORMAL_MAD
         memory = now.weight[columns] + count
         share = count / np.minimum(memory, MEMORY + count)
         now.deviation, now.weight = now.deviation.copy(), now.weight.copy()

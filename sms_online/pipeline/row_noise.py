@@ -21,14 +21,13 @@ import msgspec
 import numpy as np
 
 from sms_online.pipeline.latency import SourceGroup
-from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS, STEPS
+from sms_online.pipeline.momentum_windows import EXPONENT, HOPS, INSTANTS, STEPS, STEPS_A_HOP
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.stamp_jitter import Jitter
 from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-STEPS_A_HOP = STEPS // HOPS
 # Share of the variance by sensors that is added to a row alone, for the rounding of the factorisation.
 OWN_SHARE = 1e-7
 # What the clock of a device is off by, 1σ, s, when it has been watched for CLOCK_KNOWN, s, and before. The line behind
