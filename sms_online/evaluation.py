@@ -6,6 +6,7 @@ same. `verdict.judged` adds whether to trust it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -58,6 +59,12 @@ def beside_prior(estimate: Estimate, std: Array, prior: Prior) -> tuple[Array, A
     value[known] = (of_both * estimate.pi[known] - of_prior * prior.value[known]) / rest
     out[known] = std[known] * np.sqrt(of_both / rest)
     return value, out
+
+
+def negative(names: Sequence[str], beta: Array, std: Array) -> list[str]:
+    """Those of the names whose parameters β (n,) are negative beyond their 95 % interval and cannot be; std (n,)."""
+    below = [name for name, upper in zip(names, beta + NORMAL_95 * std, strict=True) if upper < 0.0]
+    return [name for name in below if not_negative(name)]
 
 
 class Evaluation:
@@ -271,6 +278,5 @@ class Evaluation:
     @property
     def negative(self) -> list[str]:
         """Names of parameters that are negative beyond their interval and cannot be."""
-        upper = self.estimate.pi + NORMAL_95 * np.where(self.determined, self.std, np.inf)
-        below = [p.name for p, each in zip(self.parameters, upper, strict=True) if each < 0.0]
-        return [name for name in below if not_negative(name)]
+        names = [p.name for p in self.parameters]
+        return negative(names, self.estimate.pi, np.where(self.determined, self.std, np.inf))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,34 +15,45 @@ from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.schema import System
 from sms_online.diagnosis.evidence import RANK_TOLERANCE
+from sms_online.diagnosis.residuals import RowResidual
 from sms_online.errors import InputError
+from sms_online.evaluation import negative
+from sms_online.fixed_residual import FixedResidual
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.physical import PhysicalSet
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.torque_gains import GAIN, gain_columns
-from sms_online.result import Parameters, Result
+from sms_online.result import Parameter, Parameters, Result
 from sms_online.row_types import joint_rows
 from sms_online.stream import Array
 from sms_online.tables import Tabled
+from sms_online.verdict.reasons import DESCRIBE, DIAGNOSE, LARGEST_DISTANCE, NOISE_RESIDUAL, NOISE_WHITENED, listed
 
 SCHEMA = "sms-online/validation/1"
 # Parameters that predict another run within this multiple of what any parameters leave there hold for both.
 HOLDS = 1.15
 # And less than this share of a torque is none.
 NEGLIGIBLE = 0.01
+# What validation says of parameters: they hold; they do as well as a fit to the run, which leaves a large share of a
+# torque unexplained; they differ from those of the run; nothing has them.
+Verdict = Literal["hold", "unexplained", "differ", "impossible"]
 
 
 @dataclass(frozen=True)
 class Predicted:
     """The prediction error of a joint's torque or force, as a share: rms over rms.
 
-    left: with everything fixed. least: with parameters fitted to this run, what the description itself lacks and noise.
+    left: with everything fixed. least: with parameters fitted to this run, what the description itself lacks and noise,
+    of which a fit takes some for motion. rows: what is left of the joint's momentum rows over the sensors' noise in
+    them, None where that is not known.
     """
 
     left: float
     least: float
+    rows: RowResidual | None = None
 
     @property
     def ratio(self) -> float:
@@ -51,8 +62,18 @@ class Predicted:
 
     @property
     def holds(self) -> bool:
-        """Whether the parameters hold for this joint: fitting them to this run would gain little."""
-        return self.left <= max(NEGLIGIBLE, HOLDS * self.least)
+        """Whether the parameters hold for this joint: fitting them to this run would gain little, or noise alone."""
+        return self.left <= max(NEGLIGIBLE, HOLDS * self.least) or (self.rows is not None and not self.rows.beyond)
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether a large share of the torque is left that is not noise."""
+        return self.left > NOISE_RESIDUAL and (self.rows is None or self.rows.whitened > NOISE_WHITENED)
+
+    def document(self) -> dict[str, float | None]:
+        """The entry of validation.json."""
+        noise = (None, None) if self.rows is None else (self.rows.whitened, self.rows.limit)
+        return {"left": self.left, "least": self.least, "whitened": noise[0], "limit": noise[1]}
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,32 +81,57 @@ class Validation(Tabled):
     """A run whose torques were predicted with fixed parameters.
 
     system: with which description. duration: of the run, s. joints: `joint_i` to what is left of its torque; those
-    without a torque are left out. warnings: of the source, and of a motion beyond what effects are known for.
+    without a torque are left out. impossible: why nothing has the parameters, a clause each. diagnosed: whether the
+    system is what a diagnosis has found. warnings: of the source, and of a motion beyond what effects are known for.
     """
 
     system: str
     duration: float
     joints: Mapping[str, Predicted]
+    impossible: tuple[str, ...] = ()
+    diagnosed: bool = False
     warnings: tuple[str, ...] = ()
 
     LEFT = 1
 
     @property
+    def verdict(self) -> Verdict:
+        """What is said of the parameters; the first that applies, from the worst on."""
+        if self.impossible:
+            return "impossible"
+        if not all(each.holds for each in self.joints.values()):
+            return "differ"
+        return "unexplained" if any(each.unexplained for each in self.joints.values()) else "hold"
+
+    @property
     def holds(self) -> bool:
-        """Whether the parameters hold on this run too, at every joint."""
-        return all(each.holds for each in self.joints.values())
+        """Whether the parameters hold on this run too, at every joint, and explain it."""
+        return self.verdict == "hold"
 
     @property
     def sentence(self) -> str:
-        """The worst joint, in a sentence."""
-        failing = {name: each for name, each in self.joints.items() if not each.holds}
-        if not failing:
-            name, worst = max(self.joints.items(), key=lambda item: item[1].left)
-            return f"The parameters hold on this run: at most {100.0 * worst.left:.2g} % of a torque is left ({name})."
-        name, worst = max(failing.items(), key=lambda item: item[1].ratio)
-        left = f"{100.0 * worst.left:.2g} % of the torque of {name} is left"
-        ratio = f"{worst.ratio:.3g} times the residual of parameters fitted to it"
-        return f"The parameters do not hold on this run: {left}, {ratio}."
+        """The verdict, the worst joint and the next step, in a sentence."""
+        verdict, joints = self.verdict, self.joints.items()
+        if verdict == "impossible":
+            then = (
+                "see what their diagnosis left unexplained" if self.diagnosed else "diagnose the run that they are from"
+            )
+            return f"The parameters cannot be, whatever they leave of this run: {'; '.join(self.impossible)}; {then}."
+        if verdict == "differ":
+            name, worst = max((each for each in joints if not each[1].holds), key=lambda item: item[1].ratio)
+            left = f"{100.0 * worst.left:.2g} % of the torque of {name} is left"
+            ratio = f"{worst.ratio:.3g} times the residual of parameters fitted to it"
+            beside = "" if worst.rows is None else f" and {worst.rows.whitened:.3g} times its noise"
+            return f"The parameters do not hold on this run: {left}, {ratio}{beside}."
+        if verdict == "unexplained":
+            name, worst = max((each for each in joints if each[1].unexplained), key=lambda item: item[1].left)
+            as_well = "The parameters predict this run as well as those fitted to it"
+            left = f"{100.0 * worst.left:.2g} % of the torque of {name} is unexplained in both"
+            return f"{as_well}, but {left}: {DESCRIBE if self.diagnosed else DIAGNOSE}."
+        name, worst = max(joints, key=lambda item: item[1].left)
+        noise = worst.left > NEGLIGIBLE and worst.rows is not None and not worst.rows.beyond
+        left = f"at most {100.0 * worst.left:.2g} % of a torque is left ({name})"
+        return f"The parameters hold on this run: {left}{', no more than noise' if noise else ''}."
 
     def document(self) -> dict[str, Any]:
         """validation.json as plain dictionaries and numbers."""
@@ -93,16 +139,27 @@ class Validation(Tabled):
             "schema": SCHEMA,
             "system": self.system,
             "duration_s": self.duration,
+            "verdict": self.verdict,
             "holds": self.holds,
             "sentence": self.sentence,
-            "joints": {name: {"left": each.left, "least": each.least} for name, each in self.joints.items()},
+            "impossible": list(self.impossible),
+            "joints": {name: each.document() for name, each in self.joints.items()},
             "warnings": list(self.warnings),
         }
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """Headings and cells of a table."""
-        cells = [[name, f"{e.left:.3g}", f"{e.least:.3g}", f"{e.ratio:.2f}"] for name, e in self.joints.items()]
-        return ["joint", "share of torque left", "fitted to this run", "ratio"], cells
+        cells = [
+            [
+                name,
+                f"{e.left:.3g}",
+                f"{e.least:.3g}",
+                f"{e.ratio:.2f}",
+                "" if e.rows is None else f"{e.rows.whitened:.3g}",
+            ]
+            for name, e in self.joints.items()
+        ]
+        return ["joint", "share of torque left", "fitted to this run", "ratio", "times noise"], cells
 
 
 def validate(
@@ -114,8 +171,9 @@ def validate(
     """Predict the torques of recorded data with fixed parameters, and measure the error.
 
     data: as for `estimate`. parameters: values by name, or those of a `Result`; the nominal ones of the system file
-    unless given. gains: share by which the torques of some joints, by name, are read too large; those that a `Result`
-    has found unless given. Nothing is estimated from the data but for comparison.
+    unless given. Values without a deviation count as exact. gains: share by which the torques of some joints, by name,
+    are read too large; those that a `Result` has found unless given. Nothing is estimated from the data but for
+    comparison.
     Raises InputError where the data do not fit the system, a parameter is missing, or there is no torque to predict.
     """
     if isinstance(parameters, Result):
@@ -133,8 +191,12 @@ def validate(
     held = [gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in described]
     motion = MotionRecord(system.sample_rate)
     session.observers.append(motion)
+    channels = tuple(recorded.source.channels)
+    residual = FixedResidual(session, system, channels) if FixedResidual.known(session, system) else None
     for block in recorded.source:
         session.push(block)
+        if residual is not None:
+            residual.push(block)
     session.finish()
     beta = _values(session.base, system, parameters)
     sums = {joint_rows(i): each for i, each in enumerate(session.energy.joint_residuals) if each.signal > 0.0}
@@ -142,9 +204,14 @@ def validate(
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
     known = np.array(held)
     fitted = _fitted(list(sums.values()), beta, known, gain_columns(session.model, session.base, ()))
-    joints = {name: Predicted(_share(each, beta, known), _share(each, fitted, known)) for name, each in sums.items()}
+    rows = {} if residual is None else residual.by_type(beta, gains)
+    joints = {
+        name: Predicted(_share(each, beta, known), _share(each, fitted, known), rows.get(name))
+        for name, each in sums.items()
+    }
     warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
-    return Validation(system.name, session.duration, joints, warnings)
+    cannot = _impossible(session.model, session.base, beta, parameters)
+    return Validation(system.name, session.duration, joints, cannot, bool(system.fitted), warnings)
 
 
 def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
@@ -170,6 +237,41 @@ def _values(base: BaseParameters, system: System, parameters: Parameters | Mappi
     if missing:
         raise InputError(system.name, missing[0], "no value", "a value of every parameter of this system")
     return np.array([values[parameter.name] for parameter in base.parameters])
+
+
+def _impossible(
+    model: Model, base: BaseParameters, beta: Array, parameters: Parameters | Mapping[str, float] | None
+) -> tuple[str, ...]:
+    """Why nothing has parameters β (n,), a clause each.
+
+    Of deviations the correlation is not known: without any, the distance from possible parameters is at most √n times
+    too large.
+    """
+    names, values, beside = [parameter.name for parameter in base.parameters], beta, ""
+    if parameters is None:
+        # A system file states them one by one, not as they are lumped.
+        own, beside = [base.physical[k] for k in base.independent], " beside what else is described"
+        names, values = [parameter.name for parameter in own], np.array([parameter.nominal for parameter in own])
+        fitted = model.system.fitted
+        std = np.array([fitted[name].std or np.inf if name in fitted else 0.0 for name in names])
+    else:
+        given = [parameters[name] for name in names]
+        std = np.array([each.std if isinstance(each, Parameter) else 0.0 for each in given])
+    below = negative(names, values, std)
+    are = "are" if len(below) > 1 else "is"
+    out = [f"{listed(below)} {are} negative{beside}, which is not physical"] if below else []
+    known = np.isfinite(std) & (std > 0.0)
+    variance = np.full(std.size, np.inf)
+    variance[known] = std[known] ** 2
+    try:
+        nearest = PhysicalSet(model, base).project(beta, np.diag(variance))
+    except ArithmeticError:
+        return tuple(out)
+    distance = nearest.distance / np.sqrt(max(1, int(known.sum())))
+    if distance > LARGEST_DISTANCE:
+        of = listed(nearest.active)
+        out.append(f"no distribution of mass has those of {of}, by at least {distance:.0f} standard deviations")
+    return tuple(out)
 
 
 def _fitted(sums: list[SquaredResidual], beta: Array, known: Array, gains: Sequence[int]) -> Array:

@@ -8,9 +8,25 @@ from pathlib import Path
 import pytest
 
 import sms_online as sms
+from sms_online.description.parse import parse_system
+from sms_online.diagnosis.residuals import RowResidual
+from sms_online.validation import HOLDS, Predicted, Validation
 from sms_tools.cli import main
 from tests.one_link import one_link
 from tests.test_compare import ELASTIC_AXIS, STIFFNESS
+from tests.test_torque_gains import ARM
+
+# Friction that the rig does not have, of so little damping that it does nothing beside 10 N m s/rad.
+FRICTION = """
+[[effect]]
+name = "viscous_friction"
+where = "joint_1"
+[fitted]
+"viscous_friction@joint_1.damping" = { value = -1e-3, std = %g }
+"joint_1.stiffness" = { value = %g, std = 1.0 }
+"""
+NOISE = RowResidual(whitened=1.1, limit=1.3)
+MORE = RowResidual(whitened=15.0, limit=1.3)
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +83,60 @@ def test_a_link_whose_shape_is_not_measured_is_predicted_as_well() -> None:
     found = sms.validate(system, capture)
     assert list(found.joints) == ["joint_1"]
     assert 0.0 < found.joints["joint_1"].least <= found.joints["joint_1"].left
+
+
+@pytest.mark.slow
+def test_true_parameters_hold_where_a_fit_takes_noise_for_motion() -> None:
+    """A rigid arm whose torques are little beside their noise: grade B, seed 1."""
+    arm = parse_system(ARM, "arm.toml")
+    found = sms.validate(arm, sms.simulate(arm, grade="B", seed=1, duration=4.0))
+    noisy = found.joints["joint_1"]
+    assert noisy.ratio > HOLDS
+    assert noisy.rows is not None
+    # Noise is predicted to a tenth, and 4 s are few windows.
+    assert noisy.rows.whitened == pytest.approx(1.0, abs=0.3)
+    assert found.verdict == "hold"
+    assert "no more than noise" in found.sentence
+
+
+@pytest.mark.parametrize(("std", "verdict"), [(1e-4, "impossible"), (1e-2, "hold")])
+def test_a_negative_friction_is_impossible_however_well_it_predicts(rig: Path, std: float, verdict: str) -> None:
+    text = ELASTIC_AXIS.format(stiffness=STIFFNESS) + FRICTION % (std, STIFFNESS)
+    found = sms.validate(parse_system(text, "rig.toml"), rig / "tuesday.csv")
+    assert all(each.holds for each in found.joints.values())
+    assert found.verdict == verdict
+    assert found.holds == (verdict == "hold")
+    assert ("viscous_friction@joint_1.damping is negative" in found.sentence) == (verdict == "impossible")
+
+
+def test_an_inertia_that_no_distribution_of_mass_has_is_impossible(rig: Path) -> None:
+    fitted = '\n[fitted]\n"link_1.inertia" = { value = -1.5, std = 0.1 }\n'
+    found = sms.validate(
+        parse_system(ELASTIC_AXIS.format(stiffness=STIFFNESS) + fitted, "rig.toml"), rig / "tuesday.csv"
+    )
+    assert found.verdict == "impossible"
+    assert "no distribution of mass has those of link_1" in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("joint", "verdict"),
+    [
+        (Predicted(0.25, 0.22, MORE), "unexplained"),
+        (Predicted(0.25, 0.22), "unexplained"),  # whatever its noise is
+        (Predicted(0.25, 0.22, NOISE), "hold"),
+        (Predicted(0.05, 0.045, MORE), "hold"),  # real rigs are never perfect
+        (Predicted(0.25, 0.15, MORE), "differ"),
+        (Predicted(0.25, 0.15, NOISE), "hold"),
+        (Predicted(0.009, 0.001, MORE), "hold"),
+    ],
+)
+def test_the_verdict_of_what_is_left(joint: Predicted, verdict: str) -> None:
+    found = Validation("rig", 5.0, {"joint_1": joint, "joint_2": Predicted(0.001, 0.001, NOISE)})
+    assert found.verdict == verdict
+    assert found.holds == (verdict == "hold")
+    assert ("run `sms-online diagnose`" in found.sentence) == (verdict == "unexplained")
+
+
+def test_what_a_diagnosis_found_is_not_to_be_diagnosed_again() -> None:
+    found = Validation("rig", 5.0, {"joint_1": Predicted(0.25, 0.22, MORE)}, diagnosed=True)
+    assert "unexplained in both: describe what acts there" in found.sentence

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+
 from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.runs import read_results
 from sms_adapters.session_log import SYSTEM
 from sms_online.description.schema import System
 from sms_online.pipeline.torque_gains import GAIN
 from sms_online.recorded import Recorded
+from sms_online.result import Parameter, Parameters
 from sms_online.validation import validate
 from sms_tools.exit_codes import OK
 from sms_tools.report import say, table
@@ -19,8 +22,6 @@ from sms_tools.session import check_part, described_system
 from sms_tools.waiting import watched
 
 NAME = "validation.json"
-# Numbers by name.
-Values = dict[str, float]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def _described(args: argparse.Namespace) -> tuple[System, Values | None, Values, Path | None]:
+def _described(args: argparse.Namespace) -> tuple[System, Parameters | None, dict[str, float], Path | None]:
     """System, parameters and gains of a results.json or of a run's folder; of a system file its nominal values."""
     path = Path(args.system)
     if path.is_dir() and (path / SYSTEM).exists() and not (path / RESULTS).exists():
@@ -47,6 +48,9 @@ def _described(args: argparse.Namespace) -> tuple[System, Values | None, Values,
         system, folder = described_system(args)
         return system, None, {}, folder
     document = read_results(path)
-    values = {parameter["name"]: float(parameter["estimate"]) for parameter in document["parameters"]}
+    values = Parameters(
+        Parameter(p["name"], p["symbol"], p["unit"], p["estimate"], p["std"] or np.inf, p["identifiable"])
+        for p in document["parameters"]
+    )
     gains = {each["where"]: float(each["estimate"]) for each in document["calibration"] if each["name"] == GAIN}
     return System.model_validate(document["system"]), values, gains, None

@@ -1,0 +1,74 @@
+"""What fixed parameters leave of a session's momentum rows, compared with what the sensors' noise alone leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sms_online.description.schema import System
+from sms_online.diagnosis.constants import corrected
+from sms_online.diagnosis.followed import least_samples
+from sms_online.diagnosis.record import SampleRecord, bounded, excerpts
+from sms_online.diagnosis.residuals import ResidualTest, RowResidual
+from sms_online.diagnosis.rows import SessionRows
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.relinearisation import NOISE_RENEWED, PASS_BAND
+from sms_online.pipeline.sensing import is_slow, stated_period
+from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
+from sms_online.pipeline.torque_gains import GAIN
+from sms_online.stream import Array, Block
+
+
+class FixedResidual:
+    """Keeps a session's samples, and estimates their noise on the way.
+
+    channels: of the blocks to come.
+    """
+
+    def __init__(self, session: Estimator, system: System, channels: Sequence[str]) -> None:
+        self._session, self._system = session, system
+        sensing = session.sensing
+        self._columns = [channels.index(name) for name in sensing.channels]
+        self._record = SampleRecord(system.sample_rate)
+        session.observers.append(self._record)
+        self._estimate = NoiseEstimate(sensing, system.sample_rate, PASS_BAND / system.windows.momentum)
+        self._noise: SensorNoise | None = None
+        self._renewed = -np.inf
+
+    @staticmethod
+    def known(session: Estimator, system: System) -> bool:
+        """Whether a system's rows are known: all coordinates are measured, and fast enough for the windows."""
+        sensing = session.sensing
+        positions = tuple(sensing.channels[k] for k in sensing.position_columns)
+        return not sensing.missing and not is_slow(stated_period(system, positions), system.windows.momentum)
+
+    def push(self, block: Block) -> None:
+        """Take the block that the session has just taken."""
+        self._estimate.push(block.t, block.values[:, self._columns])
+        # How slow a noise is follows from what the samples of many seconds say.
+        if block.t.size and block.t[-1] >= self._renewed + NOISE_RENEWED and self._estimate.ready:
+            self._renewed = float(block.t[-1])
+            self._noise = self._estimate.noise(self._session.periods, self._system)
+
+    def by_type(self, beta: Array, gains: Mapping[str, float]) -> dict[str, RowResidual]:
+        """Residuals of parameters β (n,) by row type; empty where there are too few samples, or noise has no effect.
+
+        gains: share by which joints' torques are read too large, by name.
+        """
+        noise, sensing = self._noise, self._session.sensing
+        length, most = bounded(self._system)
+        whole = [corrected(self._system, sensing.channels, each) for each in self._record.segments()]
+        least = least_samples(self._system)
+        segments = [part for part in excerpts(whole, length, most) if part.index.size > least]
+        if noise is None or noise.exact or not segments:
+            return {}
+        try:
+            rows = SessionRows(self._session.model, self._session.base, sensing, noise, segments, beta)
+        except np.linalg.LinAlgError:
+            # Readings that no shape of the links gives.
+            return {}
+        nuisances = rows.calibrated.nuisances
+        held = np.array([gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in nuisances])
+        residual = rows.Y @ beta + rows.calibrated.columns @ held - rows.b
+        return ResidualTest(rows).of(residual / rows.std)
