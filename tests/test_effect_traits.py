@@ -147,3 +147,12 @@ def test_every_effect_of_the_package_is_listed() -> None:
         for name in [ast.literal_eval(node.args[0])]
     }
     assert defined == set(NAMES)
+
+
+def test_an_offset_names_the_friction_that_looks_the_same() -> None:
+    said = ENTRIES["torque_offset"].said
+    assert said is not None
+    words = said("joint_1", {"torque": -0.002})
+    assert words.startswith(
+        "the torque of joint_1 reads 0.002 too little at the shaft, or its Coulomb friction differs"
+    )

@@ -80,13 +80,17 @@ class TorqueRipple(Cogging):
 class TorqueOffset(MotorSide):
     """The measured torque reads c too much at the motor shaft (N m; N on a direct drive), so the arm feels -n c.
 
+    Coulomb friction that differs by direction is symmetric friction and such an offset.
     Limitations: constant over the session; a drifting amplifier needs a slower model.
     """
 
     entry = Entry(
         "torque_offset", "force", "driven joint", {"torque": "N m"}, "standstill under a known torque",
         traits=Traits(signed=True, curve=Curve("motor speed"), begins=True, calibrates=("drive_offset",)),
-        said=lambda where, given: f"the torque of {where} reads {beyond_zero(given['torque'])}: set its zero anew",
+        said=lambda where, given: (
+            f"the torque of {where} reads {beyond_zero(given['torque'])} at the shaft, or its Coulomb friction differs "
+            "by direction: no motion distinguishes them, look at what it reads at rest without load"
+        ),
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
