@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import tracemalloc
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -126,10 +127,32 @@ def test_empty_and_nan_cells_are_gaps_counted_per_channel(tmp_path: Path) -> Non
     reader = CaptureReader(write(tmp_path / "run.csv", "t,q_1,q_2,q_3\n0,,1,1\n1,nan,NaN,2\n\n2,5,6,7\n"))
     _, values = read(reader)
     assert np.array_equal(values, np.array([[np.nan, 1, 1], [np.nan, np.nan, 2], [5, 6, 7]]), equal_nan=True)
-    assert reader.warnings == [
-        "run.csv: 2 of 3 cells empty or NaN in q_1",
-        "run.csv: 1 of 3 cells empty or NaN in q_2",
-    ]
+    # With one sample nobody knows how often; with two, 2 s apart, none is missing between.
+    assert reader.warnings == ["run.csv: 2 of 3 cells empty or NaN in q_1, the longest hole from 0 s on"]
+
+
+@pytest.mark.parametrize(
+    ("lost", "warnings"),
+    [
+        ([], []),
+        ([4], ["run.csv: 251 of 300 cells empty or NaN in q_2, the longest hole from 0.31 s on"]),
+        (range(49, 50), []),  # devices do not end together
+        (range(30, 50), ["run.csv: 270 of 300 cells empty or NaN in q_2, the longest hole from 2.91 s on"]),
+        (range(20), ["run.csv: 270 of 300 cells empty or NaN in q_2, the longest hole from 0 s on"]),
+        (range(50), ["run.csv: 300 of 300 cells empty or NaN in q_2"]),
+    ],
+    ids=["none", "one", "the last", "many last", "many first", "all"],
+)
+def test_cells_between_the_samples_of_a_slower_channel_lack_nothing(
+    tmp_path: Path, lost: Iterable[int], warnings: list[str]
+) -> None:
+    """Five seconds of q_1 fifty times a second, and of q_2 ten times, between them."""
+    rows = [f"{k / 50:.2f},1," for k in range(250)]
+    rows += [f"{k / 10 + 0.01:.2f},,{'' if k in lost else 1}" for k in range(50)]
+    text = "\n".join(sorted(rows, key=lambda row: float(row.split(",")[0])))
+    reader = CaptureReader(write(tmp_path / "run.csv", f"t,q_1,q_2\n{text}\n"))
+    read(reader)
+    assert reader.warnings == warnings
 
 
 @pytest.mark.parametrize("cut", ["3", "3,", "3,1", "3,1.", "3,1e-", "3,1.5"])

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
+from numpy.typing import NDArray
 
 from sms_adapters.files import WholeFile
 from sms_adapters.lines import CHUNK, LineReader, sampled_line
@@ -23,6 +24,9 @@ BLOCK = 16384  # rows: most that one block holds
 LARGEST = 1e30
 # Seconds since 1970 until the year 2286; a time beyond that is none.
 LATEST = 1e10
+# A channel lacks samples where it has none for so many times its mean interval: one lost sample makes two. At either
+# end it may have none for more, for devices do not begin and end together.
+LACKING, AT_AN_END = 1.5, 10.0
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*")
 
 
@@ -33,7 +37,7 @@ class CaptureReader:
     others are errors. One chunk of text is held at a time.
 
     Empty and NaN cells are NaN in the block, a later sample with an equal time is skipped, and so is a last line that
-    does not end in a newline; each is counted in `warnings`.
+    does not end in a newline; each is counted in `warnings`, but for cells between the samples of a slower channel.
     Raises InputError, on construction for the file and its header, while iterating for a malformed line, a value beyond
     all sense, a time that is missing or goes back, or no sample at all. Rows of earlier chunks are out by then.
     """
@@ -63,12 +67,15 @@ class CaptureReader:
     def warnings(self) -> list[str]:
         """What the current iteration has skipped or left empty so far."""
         found = []
-        by_count: dict[int, list[str]] = {}
-        for channel, count in zip(self._channels, self._unsampled.tolist(), strict=True):
-            if count:
-                by_count.setdefault(count, []).append(channel)
-        for count, channels in by_count.items():
-            found.append(f"{self._path.name}: {count} of {self._rows} cells empty or NaN in {', '.join(channels)}")
+        alike: dict[tuple[int, str], list[str]] = {}
+        for channel, sampled in zip(self._channels, self._sampled, strict=True):
+            start = sampled.hole(self._last) if self._rows else None
+            if start is not None:
+                where = f", the longest hole from {start:.6g} s on" if sampled.count else ""
+                alike.setdefault((self._rows - sampled.count, where), []).append(channel)
+        for (count, where), channels in alike.items():
+            cells = f"{count} of {self._rows} cells empty or NaN in {', '.join(channels)}"
+            found.append(f"{self._path.name}: {cells}{where}")
         if self._repeated:
             found.append(f"{self._path.name}: {self._repeated} samples skipped, their time repeats the one before")
         return found + self._lines.warnings
@@ -92,9 +99,10 @@ class CaptureReader:
                 t = rows[:, 0]
                 if not t.size:
                     continue
-            last = t[-1]
+            self._last = last = float(t[-1])
+            for sampled, column in zip(self._sampled, rows[:, 1:].T, strict=True):
+                sampled.add(t, np.flatnonzero(~np.isnan(column)), self._rows)
             self._rows += len(rows)
-            self._unsampled += np.isnan(rows[:, 1:]).sum(axis=0)
             yield from Block(t, self._channels, rows[:, 1:]).pieces(BLOCK)
         if not self._rows:
             raise InputError(str(self._path), "", "no samples", "at least one row below the header")
@@ -102,7 +110,8 @@ class CaptureReader:
     def _reset(self) -> None:
         self._rows = 0
         self._repeated = 0
-        self._unsampled = np.zeros(len(self._channels), dtype=np.int64)
+        self._last = -math.inf
+        self._sampled = [_Sampled() for _ in self._channels]
 
     def _parse(self, line: int, chunk: memoryview) -> Array:
         """(rows, 1 + C) of whole lines of text, t first; InputError names the first malformed line."""
@@ -141,6 +150,42 @@ class CaptureReader:
             cell = text.split(",", 1)[0]
             found = "no time" if math.isnan(t[wrong.argmax()]) else f"time {cell} s, before that of the line above"
             raise InputError(str(self._path), f"line {number}", found, "times that do not go back")
+
+
+class _Sampled:
+    """When a channel was sampled, and the longest hole of empty cells between: its length and beginning, s."""
+
+    def __init__(self) -> None:
+        self.count, self._hole = 0, (0.0, math.nan)
+        self._begin = self._first = self._last = math.nan
+        self._row = 0
+
+    def add(self, t: Array, filled: NDArray[np.int64], row: int) -> None:
+        """Take the next rows at t (B,), those `filled` with a sample; row: how many came before."""
+        if not row:
+            self._begin = float(t[0])
+        if not filled.size:
+            return
+        if not self.count:
+            self._first = self._last = float(t[filled[0]])
+            self._row = int(filled[0]) + row
+        at, rows = np.append(self._last, t[filled]), np.append(self._row, filled + row)
+        holes = np.diff(at) * (np.diff(rows) > 1)
+        longest = int(holes.argmax())
+        self._hole = max(self._hole, (float(holes[longest]), float(at[longest])))
+        self.count += filled.size
+        self._last, self._row = float(at[-1]), int(rows[-1])
+
+    def hole(self, end: float) -> float | None:
+        """Where the longest hole begins, s, up to the last row's time; None where it is the channel's own interval."""
+        if not self.count:
+            return self._begin
+        own = (self._last - self._first) / max(1, self.count - 1)
+        at_ends = (self._first - self._begin, self._begin), (end - self._last, self._last)
+        holes = [each for each in at_ends if each[0] > AT_AN_END * own]
+        if self._hole[0] > LACKING * own:
+            holes.append(self._hole)
+        return max(holes)[1] if holes else None
 
 
 class CaptureWriter(WholeFile):
