@@ -30,7 +30,16 @@ from sms_online.result import Parameter, Parameters, Result
 from sms_online.row_types import joint_rows
 from sms_online.stream import Array
 from sms_online.tables import Tabled
-from sms_online.verdict.reasons import DESCRIBE, DIAGNOSE, LARGEST_DISTANCE, NOISE_RESIDUAL, NOISE_WHITENED, listed
+from sms_online.verdict.reasons import (
+    DESCRIBE,
+    DIAGNOSE,
+    LARGEST_DISTANCE,
+    LARGEST_RESIDUAL,
+    MOVE,
+    NOISE_RESIDUAL,
+    NOISE_WHITENED,
+    listed,
+)
 
 SCHEMA = "sms-online/validation/1"
 # Parameters that predict another run within this multiple of what any parameters leave there hold for both.
@@ -38,8 +47,9 @@ HOLDS = 1.15
 # And less than this share of a torque is none.
 NEGLIGIBLE = 0.01
 # What validation says of parameters: they hold; they do as well as a fit to the run, which leaves a large share of a
-# torque unexplained; they differ from those of the run; nothing has them.
-Verdict = Literal["hold", "unexplained", "differ", "impossible"]
+# torque unexplained; a torque is mostly noise, and contradicts nothing; they differ from those of the run; nothing has
+# them.
+Verdict = Literal["hold", "weak", "unexplained", "differ", "impossible"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +74,11 @@ class Predicted:
     def holds(self) -> bool:
         """Whether the parameters hold for this joint: fitting them to this run would gain little, or noise alone."""
         return self.left <= max(NEGLIGIBLE, HOLDS * self.least) or (self.rows is not None and not self.rows.beyond)
+
+    @property
+    def weak(self) -> bool:
+        """Whether most of the torque is left, and is noise: other parameters would do as well."""
+        return self.left > LARGEST_RESIDUAL and not self.unexplained
 
     @property
     def unexplained(self) -> bool:
@@ -101,7 +116,9 @@ class Validation(Tabled):
             return "impossible"
         if not all(each.holds for each in self.joints.values()):
             return "differ"
-        return "unexplained" if any(each.unexplained for each in self.joints.values()) else "hold"
+        if any(each.unexplained for each in self.joints.values()):
+            return "unexplained"
+        return "weak" if any(each.weak for each in self.joints.values()) else "hold"
 
     @property
     def holds(self) -> bool:
@@ -129,9 +146,12 @@ class Validation(Tabled):
             left = f"{100.0 * worst.left:.2g} % of the torque of {name} is unexplained in both"
             return f"{as_well}, but {left}: {DESCRIBE if self.diagnosed else DIAGNOSE}."
         name, worst = max(joints, key=lambda item: item[1].left)
-        noise = worst.left > NEGLIGIBLE and worst.rows is not None and not worst.rows.beyond
+        if verdict == "weak":
+            noise = f"{100.0 * min(1.0, worst.left):.2g} % of the torque of {name} is noise"
+            return f"The parameters leave no more than noise, but {noise}: {MOVE}."
+        noisy = worst.left > NEGLIGIBLE and worst.rows is not None and not worst.rows.beyond
         left = f"at most {100.0 * worst.left:.2g} % of a torque is left ({name})"
-        return f"The parameters hold on this run: {left}{', no more than noise' if noise else ''}."
+        return f"The parameters hold on this run: {left}{', no more than noise' if noisy else ''}."
 
     def document(self) -> dict[str, Any]:
         """validation.json as plain dictionaries and numbers."""
