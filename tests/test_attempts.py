@@ -140,3 +140,16 @@ def test_a_lag_is_found_where_the_spring_vanishes_without_it(coulomb: float) -> 
     beside = {effect.name for effect in found.effects} - {"sensor_lag"}
     assert beside <= ({"presliding_friction", "coulomb_friction"} if coulomb else set())
     assert found.after.parameters["joint_1.stiffness"].value == pytest.approx(K, rel=0.01)
+
+
+@pytest.mark.slow
+def test_noisy_torques_leave_the_other_rows_their_noise() -> None:
+    """Beside all candidates masses halve where torques are noisy, and with them the noise that is predicted."""
+    system = sms.load_system("paper-planar")
+    data = sms.simulate(system, duration=10.0, grade="C", seed=1)
+    values = dict(zip(data.channels, data.values.T, strict=True))
+    random = np.random.default_rng(5)
+    noisy = {name: values[name] + 5.0 * random.normal(size=data.t.size) for name in ("tau_1", "tau_2")}
+    found = sms.diagnose(system, sms.Capture.from_arrays(data.t, values | noisy))
+    left = found.search.attempt.state([]).fit.whitened
+    assert max(left[name] for name in ("link_1", "link_2", "base")) < 1.2

@@ -91,6 +91,7 @@ def test_a_session_that_the_model_explains_is_clean() -> None:
         ("sensor_lag@q_1:corner=40", 0.01),
         # Far beyond first order in the delay.
         ("torque_delay@joint_2:time=0.03", 0.01),
+        ("torque_delay@joint_*:time=0.006", 0.01),
         ("actuator_delay@joint_1:time=0.01", 0.01),
         ("actuator_delay@joint_*:time=0.004", 0.01),
         # It rings a hundred radians on: a frequency a few percent off would have nothing in common with it.
