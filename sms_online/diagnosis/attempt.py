@@ -139,20 +139,19 @@ def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | No
     explain them it shrinks π, with π their noise, and with that their weight grows without end. Beside all candidates
     π shrinks as well where rows are noisy, and what is noise exceeds the noise of that π.
     """
-    beta, left = _iterated(rows, rows.Y, prior)
-    if _likely(rows, beta) and not any(row.beyond for row in ResidualTest(rows).of(left).values()):
+    _weigh(rows, rows.Y, prior)
+    left = (rows.b - rows.Y @ rows.beta) / rows.std
+    if not any(row.beyond for row in ResidualTest(rows).of(left).values()):
         return
     columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
     if candidates and LEAST_ROWS * columns.shape[2] <= rows.b.size:
-        beta, _ = _iterated(rows, columns, prior)
-    _reweight(rows, beta)
+        _weigh(rows, columns, prior)
 
 
-def _iterated(rows: SessionRows, columns: Array, prior: Prior | None) -> tuple[Array, Array]:
-    """Parameters (n,) of rows whitened with themselves, and what they leave (W, n_v), by the columns of a joint fit.
+def _weigh(rows: SessionRows, columns: Array, prior: Prior | None) -> None:
+    """Whiten the rows with parameters of a fit of columns to them, or with the described ones where these cannot be.
 
-    Parameters that the prior keeps would hide that the rows have drawn the others to zero: they are the described ones
-    then.
+    Parameters that the prior keeps would hide that the rows have drawn the others to zero.
     """
     value, size = described(rows.model, rows.base)
     std = np.ones_like(rows.b)
@@ -160,7 +159,8 @@ def _iterated(rows: SessionRows, columns: Array, prior: Prior | None) -> tuple[A
         alone, beta = _beside_candidates(columns / std[..., None], rows.b / std, prior, value, size)
         rows.reweight(beta)
         std = rows.std
-    return beta if _likely(rows, alone) else value, (rows.b - rows.Y @ beta) / std
+    if not (_likely(rows, alone) and _likely(rows, beta)):
+        rows.reweight(value)
 
 
 def _beside_candidates(columns: Array, b: Array, prior: Prior | None, value: Array, size: Array) -> tuple[Array, Array]:
