@@ -289,13 +289,12 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     gauges = [strip for strip in strips if strip is not None]
     if entry.name == EncoderOffset.entry.name:
         return (*places(system, "angle"), *gauges)
-    if entry.name == TorqueDelay.entry.name:
-        # What one bus delivers, or one amplifier.
-        drives = list(places(system, entry.at))
-        return ("joint_*", *drives) if len(drives) > 1 else drives
-    if entry.name == ActuatorDelay.entry.name:
-        # Of a joint with one encoder it is that encoder's lag. The dead time of a controller, and that of one drive.
-        drives = [name for name in places(system, "flexible joint") if name in places(system, entry.at)]
+    if entry.name in (TorqueDelay.entry.name, ActuatorDelay.entry.name):
+        # What one bus or one controller makes late, and each drive. Of a joint with one encoder it is that encoder's
+        # lag where a torque acts late.
+        flexible = entry.name == ActuatorDelay.entry.name
+        drives = places(system, "flexible joint" if flexible else entry.at)
+        drives = tuple(name for name in drives if name in places(system, entry.at))
         return ("joint_*", *drives) if len(drives) > 1 else drives
     if entry.name != SensorLag.entry.name:
         return places(system, entry.at)
