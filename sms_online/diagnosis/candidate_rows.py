@@ -125,7 +125,7 @@ class CandidateRows(CandidateFits):
         moved = tuple(chosen) != self._beside
         self._beside = tuple(chosen)
         if not np.any(np.abs(wanted - used) > SMALL_CHANGE * (self.rows.std**2 + used)):
-            if moved and self.freed:
+            if moved and self._scale.freed:
                 self._weighed = None
                 self._whiten()
             return False
@@ -185,7 +185,7 @@ class CandidateRows(CandidateFits):
         # What is known beforehand are rows too: of parameters, and below them of calibration.
         known = prior_factor(self._prior, self._n)
         n, width, first = self._n, self._model.shape[2], self.rows.b.size
-        near = width if self.freed else 0
+        near = width if self._scale.freed else 0
         self._known = len(known) + near + self.calibrated.count
         candidates = (candidate.columns for candidate in self.candidates)
         parts = [self._model, rows.b[..., None], self.calibrated.columns, self.calibrated.synthetic, *candidates]
@@ -221,11 +221,11 @@ class CandidateRows(CandidateFits):
             column += sign * expected[:, k]
 
     def _linearise(self) -> None:
-        """Have rows without a torque that leave more than noise count by their size, about the estimate beside those of
-        the last `reweight`: see `scale_free`."""
+        """Have rows without a torque that are freed count by their size, about the estimate beside those of the last
+        `reweight`: see `scale_free`."""
         self._forget()
         self._Y, self._b = self._white, self._white_b
-        if not self.freed:
+        if not self._scale.freed:
             return
         size, n = self.rows.b.size, self._model.shape[2]
         shape, end = (len(self.rows.b), self._n_v, -1), size + self._known - self.calibrated.count
@@ -268,7 +268,7 @@ class CandidateRows(CandidateFits):
         lacking = np.maximum(0.0, (ratio - 1.0) * np.mean(self.std**2, axis=0))
         self._homogeneous = beyond & self._scale.homogeneous
         # Beside torques that leave more than noise their scale is as weak, and that of their noise draws it.
-        self._scale.free(self._scale.homogeneous if beyond.any() else beyond)
+        self._scale.free(bool(beyond.any()), self._model @ self._scale.expected / self.std)
         self._usual = self._terms([], solution)
         # Rows that are beyond it by their size may leave less than it with parameters that are too small.
         return np.where(beyond, np.maximum(0.0, ratio - 1.0), 0.0), np.where(beyond, lacking, 0.0)
@@ -298,7 +298,7 @@ class CandidateRows(CandidateFits):
     @property
     def freed(self) -> bool:
         """Whether rows without a torque leave more than noise whatever is added, and count by their size."""
-        return bool(self._scale.freed)
+        return self._scale.exceeds
 
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""

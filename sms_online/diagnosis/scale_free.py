@@ -1,8 +1,8 @@
-"""Rows without a torque that leave more than noise, made free of the scale of π to first order.
+"""Rows without a torque, made free of the scale of π to first order.
 
-Such rows are homogeneous in π: they leave r = -Yπ, and least squares lowers that by shrinking π wherever they hold more
-than noise. What counts is r beside the size s(π) of its terms, as in the criterion of the estimate (see
-`pipeline.criterion`). About π°
+Such rows are homogeneous in π: they leave r = -Yπ, and least squares lowers that by shrinking π. This matters where
+they hold more than noise, and where torques fix the scale so weakly that noise in the columns alone attenuates it. What
+counts is r beside the size s(π) of its terms, as in the criterion of the estimate (see `pipeline.criterion`). About π°
 
     r(π) s(π°) / s(π) = r° - (Y + r° gᵀ) (π - π°) + …,    g = Mπ° / s(π°)²,    s² = πᵀ M π,
 
@@ -28,6 +28,8 @@ FITS, HALVINGS = 16, 6
 NEAR = 1e-3
 # Gain of the sum of logarithms below which a fit is the last.
 SAME = 1e-3
+# Standard deviations of the scale of π by which noise in the columns may attenuate it.
+LARGEST_ATTENUATION = 1.0
 
 
 class HomogeneousRows:
@@ -121,25 +123,41 @@ def _root(information: Array) -> Array:
 class Scale:
     """Whether anything fixes the scale of π in a session's rows, and which of them count by their size as nothing does.
 
-    at (n,): parameters that fits begin from and rows are linear about. freed: speeds whose rows count by their size,
-    because they leave more than noise whatever is added.
+    expected (n,): parameters behind the weights. at (n,): those that fits begin from and rows are linear about. freed:
+    speeds whose rows count by their size. exceeds: whether they do because rows leave more than noise whatever is
+    added, and not by attenuation alone.
     """
 
     def __init__(self, b: Array, expected: Array, inertial: NDArray[np.bool_], known: bool) -> None:
         """b (W, n_v): torques of the rows. expected (n,): parameters behind their weights. known: a prior gives it."""
         self.homogeneous = ~np.any(b, axis=0)
         self.unknown = not known and bool(expected.any()) and bool(self.homogeneous.any())
-        self._expected, self._inertial = expected, inertial
+        self.expected, self._inertial = expected, inertial
         self.begin()
 
     def begin(self) -> None:
         """Nothing is fitted yet."""
         self.freed: list[int] = []
-        self.at = self._expected
+        self.exceeds = False
+        self.at = self.expected
 
-    def free(self, beyond: NDArray[np.bool_]) -> None:
-        """Free rows without a torque of speeds (n_v,) that leave more than noise."""
-        self.freed = np.flatnonzero(beyond & self.homogeneous).tolist() if self.unknown else []
+    def free(self, exceeds: bool, terms: Array) -> None:
+        """Free rows without a torque where rows leave more than noise, or where noise attenuates the scale of π.
+
+        terms (W, n_v): of whitened rows, with the parameters that are expected.
+        """
+        self.exceeds = exceeds and self.unknown
+        free = self.unknown and (exceeds or self._attenuation(terms) > LARGEST_ATTENUATION)
+        self.freed = np.flatnonzero(self.homogeneous).tolist() if free else []
+
+    def _attenuation(self, terms: Array) -> float:
+        """Shift of the scale of π by noise in the columns, in its standard deviations.
+
+        Rows without a torque have noise of unit variance for terms that are zero: so much of a least-squares fit's
+        information on the scale is none.
+        """
+        noise = float(len(terms) * np.count_nonzero(self.homogeneous))
+        return noise / np.sqrt(noise + float(np.sum(terms[:, ~self.homogeneous] ** 2)))
 
     def fit(self, Y: Array, beside: Array, b: Array, positive: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
         """Solution (n + c,) of rows b (W, n_v) with columns (W, n_v, n) and beside (W, n_v, c), and what it leaves.
@@ -148,14 +166,19 @@ class Scale:
         same with these as large as the parameters behind the weights make them.
         """
         free, n = HomogeneousRows(Y, np.flatnonzero(self.homogeneous).tolist(), self._inertial), Y.shape[2]
-        solution = free.solved(beside, b, self.at, self._expected, 1.0, positive)
+        solution = free.solved(beside, b, self.at, self.expected, 1.0, positive)
         left = b - np.concatenate((Y, beside), axis=2) @ solution
-        return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self._expected)
+        return solution, np.mean(left**2, axis=0), free.squares(solution[:n], left, self.expected)
 
     def near(self, white: Array) -> tuple[Array, Array]:
-        """Rows (n, n) and right-hand side that keep what white columns (M, n) hardly determine at what is expected."""
+        """Rows (n, n) and right-hand side that keep what columns (M, n) hardly determine near what is expected."""
         lengths = NEAR * np.linalg.norm(white, axis=0)
-        return np.diag(lengths), lengths * self._expected
+        value = lengths * self.expected
+        if self.exceeds:
+            return np.diag(lengths), value
+        # In proportion to what is expected: torques fix the scale, though weakly.
+        along = value / np.linalg.norm(value)
+        return (np.eye(value.size) - np.outer(along, along)) * lengths, np.zeros_like(value)
 
     def linearise(self, white: Array, b: Array, rest: Array, solve: Callable[[Array, Array], Array]) -> None:
         """Solve whitened rows (W, n_v, n) with right-hand side (W, n_v), each time about the solution before.
@@ -164,7 +187,7 @@ class Scale:
         solution (n + c,), that of the least cost last.
         """
         free, n, W = HomogeneousRows(white, self.freed, self._inertial), white.shape[2], len(white)
-        lengths = np.diag(self.near(white.reshape(-1, n))[0])
+        near, known = self.near(white.reshape(-1, n))
 
         def left(solution: Array) -> Array:
             return np.asarray(b - white @ solution[:n] - rest @ solution[n:])
@@ -174,8 +197,10 @@ class Scale:
             return solve(Y, b + added)
 
         def cost(solution: Array) -> float:
-            off = lengths * (solution[:n] - self._expected)
-            return cost_of(free.squares(solution[:n], left(solution), self.at), off, W)
+            off = known - near @ solution[:n]
+            squares = free.squares(solution[:n], left(solution), self.at)
+            # Where rows hold noise alone its variance is known.
+            return cost_of(squares, off, W) if self.exceeds else float(squares.sum() + off @ off / W)
 
         about(converged(about, np.concatenate((self.at, np.zeros(rest.shape[2]))), cost))
 

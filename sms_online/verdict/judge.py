@@ -70,13 +70,24 @@ def _alarmed(evidence: Evidence) -> list[Reason]:
     said = evidence.alarm in evidence.noisy or any(each.unexplained for each in evidence.discrepancies)
     if evidence.alarm is None or said:
         return []
-    return [reasons.more_than_noise(evidence.alarm, evidence.coloured)]
+    alarm = reasons.more_than_noise(evidence.alarm, evidence.coloured)
+    return [replace(alarm, grave=alarm.grave and evidence.alarm not in _biased(evidence))]
 
 
 def _unnamed(evidence: Evidence, noisy: bool) -> list[Reason]:
-    """Residuals beyond their noise for no known reason, of noisy torques or of all other rows."""
-    found = reasons.unnamed(evidence.discrepancies)
-    return [each for each in found if noisy != evidence.noisy.keys().isdisjoint(each.places)]
+    """Residuals beyond their noise for no known reason, of rows that noise alone may put there or of all others."""
+    found, of_noise = reasons.unnamed(evidence.discrepancies), {*evidence.noisy, *_biased(evidence)}
+    return [each for each in found if noisy != of_noise.isdisjoint(each.places)]
+
+
+def _biased(evidence: Evidence) -> set[str]:
+    """Rows that all in all leave no more than noise, where noise in the columns biases the estimate.
+
+    Windows were tested with an estimate that was biased further, from fewer rows.
+    """
+    if not evidence.attenuated:
+        return set()
+    return {row for row, each in evidence.residual.items() if reasons.noise_alone(each)}
 
 
 def _lasting(evidence: Evidence) -> Residuals:

@@ -110,7 +110,7 @@ def unexplained_torques(residual: Residuals) -> list[Reason]:
     shares = {name: share for name, rows in residual.items() if (share := rows.relative) is not None}
     out = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
-        if share > LARGEST_RESIDUAL and not _noise_alone(residual[name]):
+        if share > LARGEST_RESIDUAL and not noise_alone(residual[name]):
             percent = f"{100.0 * share:.0f} % of the torque or force of {name} is not explained"
             means = "the model lacks an effect there, and the parameters are biased by its absence"
             mark = f"{100.0 * share:.0f} % unexplained"
@@ -118,7 +118,7 @@ def unexplained_torques(residual: Residuals) -> list[Reason]:
     return out
 
 
-def _noise_alone(rows: Residual) -> bool:
+def noise_alone(rows: Residual) -> bool:
     """Whether rows hold no more than their sensors' noise."""
     return rows.whitened is not None and rows.whitened <= NOISE_WHITENED
 
@@ -126,7 +126,7 @@ def _noise_alone(rows: Residual) -> bool:
 def weak_torques(residual: Residuals) -> list[Reason]:
     """Torques that are little more than their noise: the motion is too weak, and nothing is known to be missing."""
     shares = {name: rows.relative for name, rows in residual.items() if rows.relative is not None}
-    weak = {name: share for name, share in shares.items() if share > LARGEST_RESIDUAL and _noise_alone(residual[name])}
+    weak = {name: share for name, share in shares.items() if share > LARGEST_RESIDUAL and noise_alone(residual[name])}
     if not weak:
         return []
     most = max(weak, key=lambda name: weak[name])
