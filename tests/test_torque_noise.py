@@ -15,15 +15,15 @@ from sms_online.pipeline.persistence import LEAST_WINDOWS, Persistence
 from sms_online.row_types import Residual
 from sms_online.verdict.torque_noise import noisy_torques
 from tests.axis import AXIS, DAMPING, INERTIA
-from tests.axis_effects import BARE, RATE, axis_block, nothing
+from tests.axis_effects import BARE, COGGING, RATE, Force, axis_block, cogging, nothing
 
 # Noise of the axis's torque, N m and s: that of neighbouring samples differs by a quarter of it.
 COLOURED, MEMORY = 0.05, 0.03
 
 
-def coloured(seed: int, seconds: float = 20.0) -> sms.Capture:
+def coloured(seed: int, seconds: float = 20.0, force: Force = nothing) -> sms.Capture:
     """The axis, with noise of first order in its torque beside the white one."""
-    block, memory = axis_block(nothing, seconds=seconds, seed=seed), np.exp(-1.0 / (MEMORY * RATE))
+    block, memory = axis_block(force, seconds=seconds, seed=seed), np.exp(-1.0 / (MEMORY * RATE))
     white = np.random.default_rng(100 + seed).standard_normal(block.t.size)
     noise = COLOURED * lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white)
     return sms.Capture.from_arrays(block.t, {"force_1": block.values[:, 0] + noise, "q_1": block.values[:, 1]})
@@ -57,6 +57,17 @@ def test_a_diagnosis_does_not_call_it_clean() -> None:
     assert (found.verdict, found.effects) == ("unexplained", ())
     assert (found.trust.level, found.trust.grave) == ("doubt", False)
     assert "no known effect explains what is left" in found.trust.reasons[0]
+
+
+@pytest.mark.slow
+def test_an_effect_beside_such_noise_is_named() -> None:
+    """What it leaves does not last, and is no force that no effect explains."""
+    found = sms.diagnose(parse_system(AXIS, "axis.toml"), coloured(1, force=cogging))
+    assert (found.verdict, [each.effect for each in found.effects]) == ("named", ["cogging@joint_1"])
+    assert found.effects[0].coefficients["amplitude"].value == pytest.approx(COGGING, rel=0.1)
+    assert (found.trust.level, found.trust.grave) == ("doubt", False)
+    assert "the parameters are trusted" not in found.trust.sentence
+    assert found.trust.next_step.startswith("if these torques are known to be so noisy, state noise: force_1")
 
 
 def test_once_it_is_stated_rows_leave_noise() -> None:

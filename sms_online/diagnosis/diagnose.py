@@ -34,6 +34,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.stream import Block
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
+from sms_online.verdict.judge import at_noise
 from sms_online.verdict.judged import evaluated
 from sms_online.verdict.reasons import LARGEST_RESIDUAL
 
@@ -153,6 +154,9 @@ def diagnose(
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
+    if said == "unexplained" and estimator_after is not before and at_noise(evaluated(estimator_after).trust):
+        # What is left beside the effects does not last.
+        said = "named"
     # With what was found constant parameters explain the capture, though its session may take what a law is inexact by
     # for a change. What a change does not explain may only look like one.
     if not partial and said != "named" and not leaves_unexplained(before):

@@ -21,7 +21,7 @@ from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
-from sms_online.verdict.reasons import DIAGNOSE, THEN_DIAGNOSE, undecided
+from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, THEN_DIAGNOSE, undecided
 from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -123,7 +123,10 @@ def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
         # Parameters come from the rows of the diagnosis then, see `posterior`.
         known = [p.determined for p in posterior(diagnosis.attempt, diagnosis.chosen)]
         trust = judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
-    steps = [reason.then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE) for reason in trust.grounds]
+    steps = [
+        reason.then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE).removeprefix(IF_NOTHING)
+        for reason in trust.grounds
+    ]
     grounds = zip(trust.grounds, steps, strict=True)
     return replace(trust, grounds=tuple(replace(reason, then=step) for reason, step in grounds))
 

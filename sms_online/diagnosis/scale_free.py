@@ -157,7 +157,7 @@ class Scale:
         information on the scale is none.
         """
         noise = float(len(terms) * np.count_nonzero(self.homogeneous))
-        return noise / np.sqrt(noise + float(np.sum(terms[:, ~self.homogeneous] ** 2)))
+        return float(noise / np.sqrt(noise + np.sum(terms[:, ~self.homogeneous] ** 2)))
 
     def fit(self, Y: Array, beside: Array, b: Array, positive: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
         """Solution (n + c,) of rows b (W, n_v) with columns (W, n_v, n) and beside (W, n_v, c), and what it leaves.

@@ -127,15 +127,20 @@ def judge_diagnosis(
     """
     if verdict == "clean":
         return after
-    noisy = [reason for reason in after.grounds if reason.mark == NOISY]
-    if verdict == "unexplained" and noisy and not (effects or after.grave):
+    if verdict == "unexplained" and at_noise(after) and not effects:
+        noisy = next(reason for reason in after.grounds if reason.mark == NOISY)
         text = "no known effect explains what is left, which does not last: noise of torques, or a fast force"
-        return Trust("doubt", (Reason(text, False, noisy[0].places, "unexplained", then=noisy[0].then), *after.grounds))
+        return Trust("doubt", (Reason(text, False, noisy.places, "unexplained", then=noisy.then), *after.grounds))
     found = _unexplained(effects, row, near, learned) if verdict == "unexplained" else _named(effects, after, either)
     # The session with what was named says so too.
     rest = [reason for reason in after.grounds if not (either and reason.mark == reasons.UNDECIDED)]
     rest = rest if after.level != "trust" else []
     return Trust("doubt", (*found, *rest), grave=found[0].grave)
+
+
+def at_noise(trust: Trust) -> bool:
+    """Whether rows leave more than their predicted noise, but nothing that lasts: torques are noisier."""
+    return not trust.grave and any(reason.mark == NOISY for reason in trust.grounds)
 
 
 def _unexplained(effects: Sequence[str], row: str | None, near: bool, learned: bool) -> list[Reason]:
@@ -157,7 +162,7 @@ def _named(effects: Sequence[str], after: Trust, either: Sequence[Reason]) -> li
         Reason(f"it lacks {effect}", after.grave, (reasons.place(effect),), reasons.kind(effect)) for effect in effects
     ]
     what, them = (effects[0], "it") if len(effects) == 1 else (f"{len(effects)} effects", "them")
-    unsure = after.grave or after.level == "not yet" or either
+    unsure = after.grave or after.level == "not yet" or either or at_noise(after)
     trusted = f"; the parameters are trusted with {them}" + (
         ", except as listed below" if after.level == "doubt" else ""
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from sms_online.row_types import Residuals
-from sms_online.verdict.reasons import DIAGNOSE, NOISE_RESIDUAL, NOISE_WHITENED, listed
+from sms_online.verdict.reasons import IF_NOTHING, NOISE_RESIDUAL, NOISE_WHITENED, listed
 from sms_online.verdict.trust import Reason
 
 # Digits of a noise to be stated.
@@ -44,5 +44,5 @@ def noisier(noisy: Mapping[str, tuple[str, float]], residual: Residuals) -> list
     text = f"{listed(channels)}: up to {most:.2g} × the noise that samples show"
     full = f"{text}; what they leave does not last from window to window, as a force would that the model lacks"
     stated = ", ".join(f"{channel} {std:.{DIGITS}g}" for channel, std in noisy.values())
-    then = f"{DIAGNOSE}; if it finds nothing, and these torques are known to be so noisy, state noise: {stated}"
+    then = f"{IF_NOTHING}if these torques are known to be so noisy, state noise: {stated}"
     return [Reason(text, False, tuple(noisy), NOISY, full, then)]
