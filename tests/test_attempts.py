@@ -142,6 +142,14 @@ def test_a_lag_is_found_where_the_spring_vanishes_without_it(coulomb: float) -> 
     assert found.after.parameters["joint_1.stiffness"].value == pytest.approx(K, rel=0.01)
 
 
+def test_rows_are_whitened_by_the_session_s_parameters_where_these_leave_noise() -> None:
+    """A first fit without weights is attenuated further."""
+    clean = attempt_of(bench(), session(None, 0.0), [])
+    np.testing.assert_array_equal(clean.rows.beta, clean.case.session.estimate().pi)
+    lacking = attempt()
+    assert np.any(lacking.rows.beta != lacking.case.session.estimate().pi)
+
+
 @pytest.mark.slow
 def test_a_perfect_model_with_noisy_torques_is_clean() -> None:
     """Torques fix the scale of all masses weakly, and noise in the columns would attenuate it by 13 deviations."""

@@ -45,6 +45,11 @@ def test_a_trajectory_that_no_controller_follows_is_refused(
     assert not Path("sim.csv").exists()
 
 
+def test_a_simulation_of_an_arm_that_nothing_moves_says_so(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--system", "axis.toml", "--capture", "sim.csv", "--duration", "1"]) == 0
+    assert "no motor moves: axis.toml has no [trajectory]" in capsys.readouterr().out
+
+
 def test_the_seed_decides_the_capture(bench: Path) -> None:
     def capture(seed: str) -> bytes:
         arguments = ["simulate", "--system", "moved.toml", "--capture", "sim.csv", "--duration", "1", "--grade", "B"]

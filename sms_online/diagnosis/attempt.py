@@ -132,20 +132,30 @@ def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
     return replace(case.noise, grid=grid, coordinates=coordinates)
 
 
-def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | None) -> None:
+def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | None, estimated: Array | None) -> None:
     """Whiten the rows with parameters of the model alone where it explains them, else of a joint fit with candidates.
 
+    estimated (n,): of the session of this model, where it has them: noise has attenuated them less than a first fit.
     Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
     explain them it shrinks π, with π their noise, and with that their weight grows without end. Beside all candidates
     π shrinks as well where rows are noisy, and what is noise exceeds the noise of that π.
     """
+    if estimated is not None:
+        rows.reweight(estimated)
+        if _at_noise(rows):
+            return
     _weigh(rows, rows.Y, prior)
-    left = (rows.b - rows.Y @ rows.beta) / rows.std
-    if not any(row.beyond for row in ResidualTest(rows).of(left).values()):
+    if _at_noise(rows):
         return
     columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
     if candidates and LEAST_ROWS * columns.shape[2] <= rows.b.size:
         _weigh(rows, columns, prior)
+
+
+def _at_noise(rows: SessionRows) -> bool:
+    """Whether the parameters that rows are whitened with leave no more than noise."""
+    left = (rows.b - rows.Y @ rows.beta) / rows.std
+    return not any(row.beyond for row in ResidualTest(rows).of(left).values())
 
 
 def _weigh(rows: SessionRows, columns: Array, prior: Prior | None) -> None:
@@ -253,7 +263,8 @@ class Attempt(Hypothesis):
         forces = [effect for effect in effects if not is_constant(effect)]
         made = make.seen(forces) if candidates is None else [make.of(effect) for effect in forces]
         if beta is None:
-            _start(rows, [candidate for candidate in made if not candidate.traits.learned], prior)
+            laws = [candidate for candidate in made if not candidate.traits.learned]
+            _start(rows, laws, prior, session.estimate().pi if same else None)
         else:
             _reweight(rows, beta)
         self._most_found = 0

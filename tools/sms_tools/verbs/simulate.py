@@ -55,5 +55,7 @@ def run(args: argparse.Namespace) -> int:
     idle = [e for e in effects if e.parameters and not any(nominal[p.name] for p in e.parameters)]
     lines += [f"warning: {e.key} has no effect: {args.system} states no coefficient of it" for e in idle]
     lines += [f"warning: {said}" for said in simulation.beyond]
+    if described.trajectory is None:
+        lines.append(f"warning: no motor moves: {args.system} has no [trajectory]; `sms-online excite` designs one")
     say(args, *lines, document=document)
     return OK
