@@ -80,6 +80,7 @@ LAWS: dict[str, Law] = {
         1: 0.3 * np.sin(s.x[:, 2]) + 0.5 * np.cos(s.x[:, 2]),
     },
     "air_drag@base:damping=3": lambda s: {0: -3 * s.v[:, 0], 1: -3 * s.v[:, 1]},
+    "rotational_drag@base:damping=3": lambda s: {2: -3 * s.v[:, 2]},
     "cable_spring@base:stiffness=3,rest_x=0.1,rest_y=-2": lambda s: {
         0: 3 * (0.1 - s.x[:, 0]), 1: 3 * (-2 - s.x[:, 1])
     },
@@ -109,6 +110,7 @@ FORCES = (
     "thruster_leak@base:force_x=0.5,force_y=0.2",
     "table_tilt@base:gravity_x=0.001,gravity_y=0.002",
     "air_drag@base:damping=5",
+    "rotational_drag@base:damping=2",
     "cable_spring@base:stiffness=20",
     "slosh@base:mass=20,stiffness=500",
     "torque_gain@joint_2:ratio=0.03",

@@ -37,6 +37,7 @@ FOUND = {
     "link_damping@link_2:time=0.001": "link_damping@link_2",
     "reaction_wheel@base:torque=0.5": "reaction_wheel@base",
     "air_drag@base:damping=5": "air_drag@base",
+    "rotational_drag@base:damping=5": "rotational_drag@base",
     "tip_payload@tip:mass=1": "tip_payload@tip",
     "torque_gain@joint_2:ratio=0.03": "torque_gain@joint_2",
     "kinematic_error@joint_1:amplitude=0.0005,phase=0.5": "kinematic_error@joint_1",

@@ -43,12 +43,16 @@ class HeldOutRows(CandidateRows):
             left[held] = self.residual(chosen, solution)[held]
         return left
 
-    def _sized(self, chosen: Sequence[int], solution: Array) -> Array:
-        """What is left (W, n_v), rows without a torque as if they had their usual size.
+    def _sized(self, chosen: Sequence[int], solution: Array, beside: Sequence[int] | None) -> Array:
+        """What is left (W, n_v), rows without a torque whitened, and as if they had their usual size.
 
-        Where they leave more than noise whatever is added, and where a fit that lacks something has shrunk them.
+        The noise of neighbouring windows has much in common, and a force that is smaller may be clear beside it. Size
+        counts where rows leave more than noise whatever is added, and where a fit that lacks something has shrunk them.
         """
         left = self.residual(chosen, solution)
+        if not self.floor.any():
+            white = (self._b - self._columns(chosen, beside) @ solution)[: left.size].reshape(left.shape)
+            left[:, self._scale.homogeneous] = white[:, self._scale.homogeneous]
         if np.any(self._scale.homogeneous):
             terms = self._terms(chosen, solution)
             sized = (self._homogeneous | self._shrunk(terms)) & (terms > 0.0)
@@ -70,10 +74,10 @@ class HeldOutRows(CandidateRows):
         """
         key = self._key(chosen, beside)
         if key not in self._held_out:
-            left = self._sized(chosen, self.solution(chosen, beside))
+            left = self._sized(chosen, self.solution(chosen, beside), beside)
             for k, solution in enumerate(self.solutions(chosen, beside)):
                 held = self.folds.predicted(k)
-                left[held] = self._sized(chosen, solution)[held]
+                left[held] = self._sized(chosen, solution, beside)[held]
             self._held_out[key] = self._by_block(left)
         return self._held_out[key]
 
@@ -81,7 +85,7 @@ class HeldOutRows(CandidateRows):
         """The same sums of the fit to all rows."""
         key = self._key(chosen, beside)
         if key not in self._fitted:
-            self._fitted[key] = self._by_block(self._sized(chosen, self.solution(chosen, beside)))
+            self._fitted[key] = self._by_block(self._sized(chosen, self.solution(chosen, beside), beside))
         return self._fitted[key]
 
     def _by_block(self, left: Array) -> Array:

@@ -33,7 +33,15 @@ from sms_online.effects.friction import (
 from sms_online.effects.learned import LearnedForce
 from sms_online.effects.link import SEPARATED_BY, LinkDamping, LinkMassDamping
 from sms_online.effects.payload import TipPayload
-from sms_online.effects.spacecraft import AirDrag, CableSpring, ReactionWheel, Slosh, TableTilt, ThrusterLeak
+from sms_online.effects.spacecraft import (
+    AirDrag,
+    CableSpring,
+    ReactionWheel,
+    RotationalDrag,
+    Slosh,
+    TableTilt,
+    ThrusterLeak,
+)
 from sms_online.effects.traits import Traits
 from sms_online.effects.transmission import Backlash, CubicStiffness, KinematicError, TorsionalHysteresis
 from sms_online.errors import InputError
@@ -42,7 +50,7 @@ from sms_online.model.effect import ForceEffect, InertiaEffect
 FORCES = (
     CoulombFriction, ViscousFriction, StribeckFriction, PreslidingFriction, LoadFriction, DirectionFriction,
     TorsionalHysteresis, CubicStiffness, Backlash, KinematicError, Cogging, TorqueRipple, LinkDamping, LinkMassDamping,
-    ReactionWheel, ThrusterLeak, TableTilt, AirDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
+    ReactionWheel, ThrusterLeak, TableTilt, AirDrag, RotationalDrag, CableSpring, Slosh, TorqueGain, TorqueOffset,
     CoupledFriction, GravitySpring, BearingViscousFriction, BearingCoulombFriction, LearnedForce,
 )  # fmt: skip
 CHANNELS = (EncoderOffset, EncoderEccentricity, SensorLag, TorqueDelay, ActuatorDelay)

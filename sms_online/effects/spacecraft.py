@@ -113,7 +113,7 @@ class TableTilt(Constant, Force):
 class AirDrag(Force):
     """f = -c ṙ_S, c `damping` in N s/m: drag of air or of an air bearing on the base.
 
-    Limitations: linear; drag on the links, and on the base's turning, is left out.
+    Limitations: linear; drag on the links is left out, and that on the base's turning is `rotational_drag`.
     """
 
     entry = Entry("air_drag", "force", "base", {"damping": "N s/m"}, "travel of the base at two speeds, and back")
@@ -125,6 +125,25 @@ class AirDrag(Force):
         """-ṙ_S."""
         f = np.zeros((*v.shape, 1))
         rows = _linear_rows(layout)
+        f[:, rows, 0] = -v[:, rows]
+        return f
+
+
+class RotationalDrag(Force):
+    """f = -c ω_0, c `damping` in N m s/rad: drag of air or of an air bearing on the base's turning.
+
+    Limitations: linear, and in space isotropic.
+    """
+
+    entry = Entry("rotational_drag", "force", "base", {"damping": "N m s/rad"}, "turns of the base at two rates")
+
+    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
+        super().__init__(site, {"damping": ("d_0r", "N m s/rad", given.get("damping", 0.0))})
+
+    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-ω_0."""
+        f = np.zeros((*v.shape, 1))
+        rows = slice(len(layout.base_linear), layout.n_base_speeds)
         f[:, rows, 0] = -v[:, rows]
         return f
 
