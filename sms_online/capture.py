@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sms_online.description.explain import expected_channel
 from sms_online.errors import InputError
-from sms_online.stream import Array, Block
+from sms_online.stream import Array, Block, Mask
 
 # Samples of a block that a capture is handed on in: few enough to show progress, many enough to cost nothing.
 PIECE = 1024
@@ -95,7 +95,7 @@ class Capture:
         return int(self.t.size)
 
 
-def _check_times(t: Array, wrong: NDArray[np.bool_], source: str, expected: str) -> None:
+def _check_times(t: Array, wrong: Mask, source: str, expected: str) -> None:
     at = np.flatnonzero(~np.isfinite(t) | wrong)
     if at.size:
         raise InputError(source, f"sample {at[0] + 1}", f"time {t[at[0]]:g} s", expected)

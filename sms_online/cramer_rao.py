@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.errors import InputError
 from sms_online.linearised import Motion, linearise
@@ -26,7 +25,7 @@ from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.model.readings import Readings
 from sms_online.sensor_set import SensorSet, session_sensors
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 from sms_online.threads import one_blas_thread
 from sms_online.trackers.factor import raw_triangle
 
@@ -65,7 +64,7 @@ class MotionRecord(Observer):
         self._every = max(1, round(STEP * sample_rate))
         self._segments: dict[int, list[Motion]] = {}
 
-    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array, inputs: Array) -> None:
+    def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array) -> None:
         """See `Observer`."""
         kept = index % self._every == 0
         piece = Motion(index[kept] / self._sample_rate, x[kept], v[kept], inputs[kept])

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.found import Calibration, found
 from sms_online.calibration.truncation import share_variance
@@ -22,7 +21,7 @@ from sms_online.pipeline.description import described, nearer
 from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.tracker_bank import Reading, rows_per_second
 from sms_online.row_types import ENERGY, Residual, joint_rows, row_types
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Consistency, Drift, Tracked, TrackerResult
 from sms_online.trackers.interface import Estimate, Prior
@@ -39,7 +38,7 @@ LARGEST_ROW_VARIANCE = 1.2
 LARGEST_BIAS = 1.0
 
 
-def identifiable(beta: Array, std: Array) -> NDArray[np.bool_]:
+def identifiable(beta: Array, std: Array) -> Mask:
     """Which parameters β (n,) the data determine: std (n,) is finite, and β three of it from zero."""
     return np.asarray(std <= LARGEST_RELATIVE_STD * np.abs(beta))
 
@@ -139,11 +138,11 @@ class Evaluation:
         return now.method == "momentum" and now.momentum is not None and bool(now.momentum.rows.misfit.any())
 
     @cached_property
-    def determined(self) -> NDArray[np.bool_]:
+    def determined(self) -> Mask:
         """Which parameters the data determine (n,), see `identifiable`: by themselves too, beside a stated value."""
         return self._determined(self.estimate, self.std)
 
-    def _determined(self, estimate: Estimate, std: Array) -> NDArray[np.bool_]:
+    def _determined(self, estimate: Estimate, std: Array) -> Mask:
         """See `determined`; of any tracker's estimate."""
         out, prior = identifiable(estimate.pi, std), self.statistics.setup.current_prior
         # What an earlier run has measured, with its correlation, are data too.

@@ -15,11 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # The squared distance, in standard deviations, that the barrier's last weight may add.
 GAP = 1e-6
@@ -212,7 +211,7 @@ class _Barrier:
         return np.asarray(pi + np.linalg.solve(R, step))
 
 
-def _follow(barrier: _Barrier, pi: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _follow(barrier: _Barrier, pi: Array) -> tuple[Array, Mask]:
     """π nearest to the target, from one that meets all conditions, and which conditions hold it."""
     weight = max(1.0, barrier.distance(pi) ** 2 / barrier.degree)
     margins = barrier.margins(pi)

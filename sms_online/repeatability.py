@@ -16,11 +16,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, norm, t
 
 from sms_online.errors import InputError
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 from sms_online.tables import Tabled, finite, formatter
 
 SCHEMA = "sms-online/comparison/1"
@@ -221,7 +220,7 @@ class Judged:
     reference: Array
     spread: Array
     limit: Array
-    changed: NDArray[np.bool_]
+    changed: Mask
     deviations: Array
 
 
@@ -248,7 +247,7 @@ def judge_changes(values: Array, stds: Array) -> Judged:
         agreeing = grown
 
 
-def _shortest_half(values: Array) -> NDArray[np.int64]:
+def _shortest_half(values: Array) -> Indices:
     """The half of the known values, rounded up, that lies closest together.
 
     Where the other half lies about as close and is earlier, it is that: the reference is the rig before a change.
@@ -266,8 +265,8 @@ def _shortest_half(values: Array) -> NDArray[np.int64]:
 def _against(
     values: Array,
     stds: Array,
-    known: NDArray[np.bool_],
-    agreeing: NDArray[np.bool_],
+    known: Mask,
+    agreeing: Mask,
     selection: Array,
     alpha: float,
 ) -> Judged:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sms_online.stream import Array, increments
+from sms_online.stream import Array, Mask, increments
 
 # Chance that a healthy sensor repeats itself so many times in a row, given how often it has repeated itself so far.
 FALSE_ALARM = 1e-12
@@ -69,7 +69,7 @@ def _jump(steps: Array, at: int) -> float:
     return float(np.linalg.lstsq(np.column_stack((behind, shape)), np.append(0.0, np.cumsum(near)))[0][0])
 
 
-def stuck_samples(values: Array) -> NDArray[np.bool_]:
+def stuck_samples(values: Array) -> Mask:
     """Where a recorded reading (B,), all finite, is stuck, as `StuckGuard` finds it."""
     kept, guard = values[:, None].copy(), StuckGuard([[0]])
     for start in range(0, len(kept), PIECE):

@@ -11,7 +11,7 @@ from sms_adapters.can_signals import WantedMessage, decode_signal, raw_word
 from sms_adapters.conversion import Conversions, FrameCounter
 from sms_adapters.raw import ERROR_FRAME, REMOTE_FRAME, CanFrames, DecodedSamples, Raw, concatenate_frames
 from sms_online.description.sources import Signal
-from sms_online.stream import increments
+from sms_online.stream import Mask, increments
 
 # Unknown identifiers that are remembered, to name them.
 _SHOWN_IDS = 5
@@ -72,7 +72,7 @@ class CanDecoder:
         used &= ~np.isnan(values).all(axis=1)
         return DecodedSamples(raw.arrival[used], raw.stamp[used], values[used])
 
-    def _plain(self, raw: CanFrames) -> NDArray[np.bool_]:
+    def _plain(self, raw: CanFrames) -> Mask:
         """(N,) frames that hold data and have a wanted identifier; the others are counted."""
         error, remote = (raw.flags & ERROR_FRAME) != 0, (raw.flags & (ERROR_FRAME | REMOTE_FRAME)) == REMOTE_FRAME
         self.counters["error_frame"] += int(np.count_nonzero(error))
@@ -84,7 +84,7 @@ class CanDecoder:
         if unknown.size and len(self.unknown_ids) < _SHOWN_IDS:
             new = [id_ for id_ in dict.fromkeys(unknown.tolist()) if id_ not in self.unknown_ids]
             self.unknown_ids += new[: _SHOWN_IDS - len(self.unknown_ids)]
-        plain: NDArray[np.bool_] = data & known
+        plain: Mask = data & known
         return plain
 
     def _admitted(self, k: int, message: WantedMessage, raw: CanFrames, rows: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -21,7 +21,7 @@ from sms_adapters.raw import EXTENDED, one_line
 from sms_online.description.explain import nearest
 from sms_online.description.sources import CanSource
 from sms_online.errors import InputError
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 CLASSIC_BYTES = 8  # of a frame that is not CAN FD
 _MOST_BITS = 32  # of a counter
@@ -40,7 +40,7 @@ class Part:
     columns: tuple[int, ...]
     condition: Condition
 
-    def held(self, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    def held(self, frames: NDArray[np.uint8]) -> Mask:
         """(B,) mask of the frames (B, bytes) of the message that hold these signals."""
         held = np.ones(len(frames), dtype=np.bool_)
         for multiplexer, values in self.condition:

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from sms_adapters.lines import LineLog, sampled_line
 from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, MOST_BYTES, REMOTE_FRAME, CanFrames
 from sms_online.errors import InputError
+from sms_online.stream import Indices, Mask
 
 Bytes = NDArray[np.uint8]
-Places = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 NANOSECONDS = 10**9
 # Digits before and behind the point of a time, of an identifier, and letters of an interface (IFNAMSIZ of Linux, and
@@ -78,7 +77,7 @@ class CandumpLog(LineLog):
 
 def parsed(
     path: Path, line: int, text: memoryview, buses: dict[bytes, int]
-) -> tuple[Places, CanFrames, NDArray[np.intp]]:
+) -> tuple[Indices, CanFrames, NDArray[np.intp]]:
     """Stamps (N,), ns, frames without times, and buses (N,) of whole lines; new buses are put into `buses`.
 
     path, line: of the file and of the first line, for the InputError of a malformed one.
@@ -134,13 +133,13 @@ def parsed(
     return seconds * NANOSECONDS + fraction, frames, bus
 
 
-def _next(b: Bytes, character: str, start: Places) -> Places:
+def _next(b: Bytes, character: str, start: Indices) -> Indices:
     """Place of the first such character from each start on; the text's size where there is none."""
     places = np.append(np.flatnonzero(b == ord(character)), b.size)
     return np.asarray(places[np.searchsorted(places[:-1], start)], dtype=np.int64)
 
 
-def _digits(b: Bytes, start: Places, stop: Places, most: int, base: int) -> tuple[Places, Mask]:
+def _digits(b: Bytes, start: Indices, stop: Indices, most: int, base: int) -> tuple[Indices, Mask]:
     """Numbers of 1 to `most` digits from start to stop, and which of them are such numbers."""
     width = stop - start
     good = (width >= 1) & (width <= most)
@@ -153,7 +152,7 @@ def _digits(b: Bytes, start: Places, stop: Places, most: int, base: int) -> tupl
     return value, good
 
 
-def _data(b: Bytes, start: Places, length: Places) -> tuple[Bytes, Mask]:
+def _data(b: Bytes, start: Indices, length: Indices) -> tuple[Bytes, Mask]:
     """(N, 64) bytes from pairs of hexadecimal digits, and which frames have nothing else in them."""
     data = np.zeros((start.size, MOST_BYTES), dtype=np.uint8)
     good = np.ones(start.size, dtype=np.bool_)
@@ -166,7 +165,9 @@ def _data(b: Bytes, start: Places, length: Places) -> tuple[Bytes, Mask]:
     return data, good
 
 
-def _names(b: Bytes, start: Places, stop: Places, good: Mask, buses: dict[bytes, int]) -> tuple[NDArray[np.intp], Mask]:
+def _names(
+    b: Bytes, start: Indices, stop: Indices, good: Mask, buses: dict[bytes, int]
+) -> tuple[NDArray[np.intp], Mask]:
     """Index in `buses` of the name from start to stop, which is extended by new ones; which lines have such a name."""
     width = np.where(good, stop - start, 0)
     good = good & (width <= _INTERFACE)

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv
-from numpy.typing import NDArray
 
 from sms_adapters.files import WholeFile
 from sms_adapters.lines import CHUNK, LineReader, sampled_line
 from sms_online.description.explain import expected_channel
 from sms_online.errors import InputError
-from sms_online.stream import Array, Block
+from sms_online.stream import Array, Block, Indices
 
 BLOCK = 16384  # rows: most that one block holds
 # Beyond all that a testbed has in SI units, and small enough that products of a few of them are numbers.
@@ -160,7 +159,7 @@ class _Sampled:
         self._begin = self._first = self._last = math.nan
         self._row = 0
 
-    def add(self, t: Array, filled: NDArray[np.int64], row: int) -> None:
+    def add(self, t: Array, filled: Indices, row: int) -> None:
         """Take the next rows at t (B,), those `filled` with a sample; row: how many came before."""
         if not row:
             self._begin = float(t[0])

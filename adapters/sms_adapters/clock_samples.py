@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sms_online.stream import Array, increments
+from sms_online.stream import Array, Indices, increments
 
 # Samples that come further apart than this, s, have a hole between them whatever the delays of a bus.
 HOLE = 0.1
@@ -24,7 +23,7 @@ class CountedTime:
         self._last: tuple[int, float] | None = None  # count and arrival of the last frame
         self._whole = 0  # its count with the rounds in it
 
-    def __call__(self, counts: NDArray[np.int64], arrival: Array) -> Array:
+    def __call__(self, counts: Indices, arrival: Array) -> Array:
         """Device times (M,), s, of frames with these counts (M,), in order of arrival (M,)."""
         if counts.size == 0:
             return np.empty(0)

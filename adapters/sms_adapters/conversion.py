@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.sources import SerialField, Signal
 from sms_online.state import Stage, State
-from sms_online.stream import Array, increments
+from sms_online.stream import Array, Indices, Mask, increments
 
 Counters = dict[str, int]
 
@@ -97,7 +96,7 @@ class FrameCounter:
         self._last = -1  # count of the last frame admitted, -1 before the first
         self._late = -1  # count of the frame before, if that was dropped as late, else -1
 
-    def admit(self, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def admit(self, counts: Indices) -> Mask:
         """(B,) mask of the frames to use, from their counts (B,) in order of arrival."""
         admitted = np.ones(counts.size, dtype=np.bool_)
         if not counts.size:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_adapters.conversion import Turns
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Bit of CanFrames.id, as socketcan's CAN_EFF_FLAG: 0x123 and the extended 0x00000123 are two identifiers.
 EXTENDED = 0x8000_0000
@@ -52,7 +52,7 @@ class CanFrames:
     def __len__(self) -> int:
         return self.arrival.size
 
-    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> CanFrames:
+    def __getitem__(self, rows: slice | Mask | NDArray[np.intp]) -> CanFrames:
         """The frames of some rows: a slice, a mask (N,) or indices."""
         return CanFrames(*(getattr(self, field.name)[rows] for field in fields(self)))
 

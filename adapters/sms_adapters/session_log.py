@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_adapters.candump import parsed
 from sms_adapters.files import reading
@@ -32,7 +31,7 @@ from sms_adapters.raw import ERROR_FRAME, EXTENDED, FD_FRAME, REMOTE_FRAME, CanF
 from sms_online.description.schema import TrackerChoice
 from sms_online.description.sources import Recorded
 from sms_online.errors import InputError
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 SCHEMA = "sms-online/recording/1"
 # Number of the rules by which raw items become rows: ticks, clocks, portions. A recording made under others replays
@@ -197,7 +196,7 @@ class RecordedItems:
                     yield replace(frames, arrival=arrival, stamp=stamp)[used]
                 before += len(frames)
 
-    def _used(self, before: int, count: int) -> NDArray[np.bool_]:
+    def _used(self, before: int, count: int) -> Mask:
         """Which of the items (count,), after so many before them, were not dropped."""
         used = np.ones(count, dtype=np.bool_)
         for first, dropped in self._dropped:

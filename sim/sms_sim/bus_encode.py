@@ -16,7 +16,7 @@ from sms_adapters.serial_decoder import FRAME_END, encode_frames, frame_layout
 from sms_online.description.schema import System
 from sms_online.description.sources import CanSource, SerialFrames, Signal
 from sms_online.errors import InputError
-from sms_online.stream import Array, Block
+from sms_online.stream import Array, Block, Indices
 
 # Longest classic frame: what is packed into one word of 64 bits.
 LONGEST_FRAME = 8
@@ -131,7 +131,7 @@ def _number(signal: Signal, values: Array) -> Array:
     return (values - signal.offset) / signal.scale
 
 
-def _bits(numbers: Array | NDArray[np.int64], signal: CanSignal) -> NDArray[np.uint64]:
+def _bits(numbers: Array | Indices, signal: CanSignal) -> NDArray[np.uint64]:
     """Whole numbers where a signal has its bits; beyond its range its end, as of a sensor that saturates."""
     half = 1 << (signal.length - 1)
     low, high = (-half, half - 1) if signal.is_signed else (0, 2 * half - 1)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.errors import InputError
-from sms_online.stream import Array, Block
+from sms_online.stream import Array, Block, Indices
 from sms_sim.distortion import Distortion
 from sms_sim.plant import Plant
 from sms_sim.realtime import STEP, STEPS_AT_ONCE, RealTimeStepper
@@ -89,7 +88,7 @@ class MovingArm:
         torque = np.stack([state.torque for state in states])
         return self._plant.channel_values(torque, np.stack([state.x for state in states]))[:, columns]
 
-    def _block(self, first: int, history: Array, delays: NDArray[np.int64], count: int) -> Block:
+    def _block(self, first: int, history: Array, delays: Indices, count: int) -> Block:
         """The readings of `count` samples from `first` on; exact values up to the last of them end history (K, C)."""
         rows = np.arange(history.shape[0] - count, history.shape[0])
         late = np.take_along_axis(history, rows[:, None] - delays, axis=0)

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from sms_online.calibration.channels import (
@@ -33,7 +32,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensitivity import SPARSE, Sensitivity, nodes
 from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # Degree of splines between instants: of a vibration of 10 Hz, 50 times a second, it loses a thousandth, a cubic a
 # thirtieth.
@@ -60,7 +59,7 @@ def _multiplied(families: Sequence[Family | TorqueFamily]) -> Iterator[Multiplie
         first += len(family.nuisances)
 
 
-def _interpolation(at: NDArray[np.int64], derivative: int = 0) -> Array:
+def _interpolation(at: Indices, derivative: int = 0) -> Array:
     """Weights (STEPS + 1, at) of a spline through values at some instants, or of its slope, by instants."""
     fine = np.linspace(0.0, INSTANTS, STEPS + 1)
     return np.asarray(make_interp_spline(at, np.eye(at.size), DEGREE)(fine, derivative))
@@ -167,7 +166,7 @@ class CalibrationColumns(Stage):
         of_force = (-phi_dot * sparse, phi_dot * sparse + phi * slope, -phi * sparse)
         return np.concatenate((of_mass, *of_force), axis=1)
 
-    def windows(self, starts: NDArray[np.int64], sensitivity: Sensitivity, rough: Array) -> Array:
+    def windows(self, starts: Indices, sensitivity: Sensitivity, rough: Array) -> Array:
         """N (W, n_v, count) of the windows that start at some instants.
 
         rough (W, STEPS + 1, n_v, sensors): what rough forces add to c.

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.multiplied_noise import Multiplied
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import Effect, System
 from sms_online.effects.catalogue import ENTRIES, places
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # One number in eighty is further off than its tolerance says by chance.
 LIMIT = 2.5
@@ -75,23 +74,23 @@ class Calibrated:
         """1σ of each (m,)."""
         return np.array([each.tolerance for each in self.nuisances])
 
-    def information(self, held: NDArray[np.bool_]) -> Array:
+    def information(self, held: Mask) -> Array:
         """Rows (m, m) of unit variance of what is known of them; held (m,): those at zero."""
         return np.diag(1.0 / (self.tolerance * np.where(held, HELD, 1.0)))
 
-    def replaced_by(self, effects: Iterable[Effect]) -> NDArray[np.bool_]:
+    def replaced_by(self, effects: Iterable[Effect]) -> Mask:
         """Which of them (m,) the effects replace: an effect in the model leaves no second unknown for the same."""
         effects = list(effects)
         return np.array([any(_replaces(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
 
-    def beyond(self, values: Array) -> NDArray[np.bool_]:
+    def beyond(self, values: Array) -> Mask:
         """Which of them (m,) an effect of the catalogue has to replace, for estimates (m,)."""
         said = np.array([each.name in self.covered for each in self.nuisances], dtype=np.bool_)
         return np.asarray(said & (np.abs(values) > LIMIT * self.tolerance))
 
     def released(
         self, effects: Iterable[Effect], rows: Array, fitted: Callable[[Array, Array], Array]
-    ) -> tuple[NDArray[np.bool_], Array]:
+    ) -> tuple[Mask, Array]:
         """Which of them (m,) are held at zero beside effects, and the solution (n + m,) with these held.
 
         rows (M, n + m + 1): all columns, theirs last, and the right-hand side, without what is known of them. fitted:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.evidence import Gain, basis, fitted, free_of, gains
 from sms_online.diagnosis.weak_rows import WeakRows
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.trackers.factor import solve
 
 # A row is acted on where a candidate's column has at least this share of its largest row's squares.
@@ -74,11 +73,11 @@ class CandidateFits:
             return np.concatenate([self._Y, *(self._Z[k] for k in chosen)], axis=1)
         return self._with_calibration(chosen, self.zeroed(chosen if beside is None else beside))
 
-    def _with_calibration(self, chosen: Sequence[int], held: NDArray[np.bool_]) -> Array:
+    def _with_calibration(self, chosen: Sequence[int], held: Mask) -> Array:
         self._N[-held.size :] = self.calibrated.information(held)
         return np.concatenate([self._Y, *(self._Z[k] for k in chosen), self._N], axis=1)
 
-    def zeroed(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
+    def zeroed(self, chosen: Sequence[int]) -> Mask:
         """Which numbers of calibration (m,) are held at zero beside those chosen: effects replace them, or have to."""
         m, key = self.calibrated.count, frozenset(chosen)
         if key not in self._zeroed:
@@ -89,7 +88,7 @@ class CandidateFits:
                 self._solved[tuple(chosen), None] = solution
         return self._zeroed[key]
 
-    def _released(self, chosen: Sequence[int], rows: Array) -> tuple[NDArray[np.bool_], Array]:
+    def _released(self, chosen: Sequence[int], rows: Array) -> tuple[Mask, Array]:
         """Which numbers of calibration (m,) are held at zero beside those chosen, and the solution (n + c + m,).
 
         rows (M, n + c + m + 1): all columns and the right-hand side, without what is known of calibration.
@@ -125,17 +124,17 @@ class CandidateFits:
 
     def _forget(self) -> None:
         """What was solved with other weights or columns."""
-        self._zeroed: dict[frozenset[int], NDArray[np.bool_]] = {}
+        self._zeroed: dict[frozenset[int], Mask] = {}
         self._solved: dict[Key, Array] = {}
         self._bases: dict[tuple[int, ...], tuple[Array, Array]] = {}
         self._gains: dict[tuple[int, ...], list[Gain]] = {}
-        self._acting: dict[int, NDArray[np.bool_]] = {}
+        self._acting: dict[int, Mask] = {}
 
     def _whitened(self, columns: Array) -> Array:
         white = self.rows.white(columns)
         return np.concatenate((white, np.zeros((self._known, white.shape[1]))))
 
-    def _acts(self, k: int) -> NDArray[np.bool_]:
+    def _acts(self, k: int) -> Mask:
         """Speeds (n_v,) in whose rows a candidate acts."""
         if k not in self._acting:
             squares = np.sum(self._plain[k] ** 2, axis=(0, 2))
@@ -167,7 +166,7 @@ class CandidateFits:
         """Solution (n + c + m,) of columns and b, see `bounds`."""
         return fitted(columns, b, self.bounds(chosen))
 
-    def bounds(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
+    def bounds(self, chosen: Sequence[int]) -> Mask:
         """Which unknowns (n + c + m,) a fit keeps from being negative, where rows leave more than noise.
 
         That draws them below zero. In other rows a value below zero within its deviation is noise.
@@ -175,7 +174,7 @@ class CandidateFits:
         positive = np.concatenate((self._not_negative(chosen), np.zeros(self.calibrated.count, dtype=bool)))
         return positive & bool(self.floor.any())
 
-    def _not_negative(self, chosen: Sequence[int]) -> NDArray[np.bool_]:
+    def _not_negative(self, chosen: Sequence[int]) -> Mask:
         """Which unknowns (n + c,) are masses, springs, dampings or coefficients that cannot be negative."""
         own = [not self.candidates[k].traits.signed for k in chosen for _ in self.candidates[k].parameters]
         return np.array([*self._positive.tolist(), *own], dtype=bool)

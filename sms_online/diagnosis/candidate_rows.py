@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.multiplied_noise import shares
 from sms_online.diagnosis.calibrated import Calibrated
@@ -16,7 +15,7 @@ from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.scale_free import Scale
 from sms_online.diagnosis.weak_rows import WeakRows
 from sms_online.pipeline.momentum_windows import HOPS
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.trackers.interface import Prior, prior_factor
 
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
@@ -85,7 +84,7 @@ class CandidateRows(CandidateFits):
         # Covariance of what the laws of the chosen effects do not determine.
         self._own, self._free = np.zeros_like(rows.std), np.zeros((len(rows.b), HOPS, self._n_v))
         # Speeds whose rows have no such covariance, with these effects chosen.
-        self._exceeding: tuple[frozenset[int], NDArray[np.bool_]] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
+        self._exceeding: tuple[frozenset[int], Mask] = frozenset(), np.zeros(self._n_v, dtype=np.bool_)
         # Mean square that everything together left of the rows, and with which deviations.
         self._explained = 0.0, rows.std
         self._scale.begin()

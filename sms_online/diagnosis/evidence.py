@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 from sms_online.trackers.interface import Prior
 
 # A column of which the model leaves less than this share is a combination of what it has.
@@ -59,7 +58,7 @@ def least_squares(columns: Array, b: Array) -> Array:
     return np.asarray(np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK_TOLERANCE)[0] / size)
 
 
-def fitted(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
+def fitted(columns: Array, b: Array, positive: Mask) -> Array:
     """Least squares (n,) for columns (M, n) and b (M,), those positive (n,) kept from being negative."""
     R = np.asarray(np.linalg.qr(np.column_stack((columns, b)), mode="r"))
     columns, b = R[:, :-1], R[:, -1]
@@ -67,7 +66,7 @@ def fitted(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
     return bounded(columns, b, positive) if np.any(solution[positive] < 0.0) else solution
 
 
-def bounded(columns: Array, b: Array, positive: NDArray[np.bool_]) -> Array:
+def bounded(columns: Array, b: Array, positive: Mask) -> Array:
     """Least squares (n,) for columns (M, n) and b (M,) of which those positive (n,) are not negative.
 
     Source: Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23.
@@ -112,9 +111,7 @@ def together(columns: Array, b: Array, prior: Prior | None) -> Array:
     return solution
 
 
-def least_squares_without(
-    columns: Array, b: Array, left_out: Sequence[NDArray[np.bool_]], positive: NDArray[np.bool_]
-) -> Array:
+def least_squares_without(columns: Array, b: Array, left_out: Sequence[Mask], positive: Mask) -> Array:
     """Solutions (B, n) for columns (M, n) and b (M,) without each of some sets of rows (M,), from one factorisation.
 
     positive (n,): which are not negative. Where columns are nearly dependent, or are so without a set,
@@ -178,7 +175,7 @@ def gains(Q: Array, r: Array, candidates: Sequence[Array]) -> list[Gain]:
     return out
 
 
-def _gain(scaled: Array, along: Array, left: Array, own: NDArray[np.int64], seen: NDArray[np.bool_]) -> Gain:
+def _gain(scaled: Array, along: Array, left: Array, own: Indices, seen: Mask) -> Gain:
     """Of columns `own` of unit columns (M, ·) of sizes `left`, and what they take of the residual."""
     c, kept = own.size, own[seen]
     coefficients, covariance = np.zeros(c), np.diag(np.full(c, np.inf))

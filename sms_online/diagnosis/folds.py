@@ -13,10 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.momentum_windows import HOPS
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # Blocks that a session is cut into; fewer where each would hold fewer windows than overlap.
 BLOCKS = 10
@@ -36,10 +35,10 @@ class Folds:
 
     def __init__(
         self,
-        block: NDArray[np.int64],
-        segment: NDArray[np.int64],
+        block: Indices,
+        segment: Indices,
         time: Array,
-        capture: NDArray[np.int64] | None = None,
+        capture: Indices | None = None,
     ) -> None:
         self.block, self._segment, self._time = block, segment, time
         self.count = int(block.max(initial=ALWAYS)) + 1
@@ -52,10 +51,10 @@ class Folds:
     @classmethod
     def of(
         cls,
-        segment: NDArray[np.int64],
+        segment: Indices,
         time: Array,
-        tested: NDArray[np.bool_] | None = None,
-        capture: NDArray[np.int64] | None = None,
+        tested: Mask | None = None,
+        capture: Indices | None = None,
     ) -> Folds:
         """Blocks of as many windows each; tested (W,): those that are held out at all, all of them by default."""
         held = np.arange(time.size) if tested is None else np.flatnonzero(tested)
@@ -64,15 +63,15 @@ class Folds:
         block[held] = np.arange(held.size) * count // max(1, held.size)
         return cls(block, segment, time, capture)
 
-    def held(self, k: int) -> NDArray[np.bool_]:
+    def held(self, k: int) -> Mask:
         """Windows (W,) of a block."""
         return np.asarray(self.block == k)
 
-    def predicted(self, part: int) -> NDArray[np.bool_]:
+    def predicted(self, part: int) -> Mask:
         """Windows (W,) of a part."""
         return np.asarray(self._part == part)
 
-    def fitted(self, part: int) -> NDArray[np.bool_]:
+    def fitted(self, part: int) -> Mask:
         """Windows (W,) that a part is predicted from: those that share no sample with it.
 
         All but the part where few of those that are tested are left: in a session of a second all windows overlap.
@@ -86,7 +85,7 @@ class Folds:
         tested = self.block != ALWAYS
         return ~near if 2 * np.count_nonzero(tested & ~near) > np.count_nonzero(tested) else ~held
 
-    def of_others(self, segment: NDArray[np.int64], time: Array) -> NDArray[np.int64]:
+    def of_others(self, segment: Indices, time: Array) -> Indices:
         """Numbers (V,) of the parts of other windows of the same session: that of the nearest of these windows."""
         out = np.full(time.size, ALWAYS, dtype=np.int64)
         for number in np.unique(segment):

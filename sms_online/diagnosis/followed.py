@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from sms_online.description.schema import System
@@ -14,7 +13,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.internal_states import InternalStates, half_width, smooth_from_the_start
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # States are advanced once in so many samples: at 1 kHz what changes at 3 Hz is computed 80 times a period.
 STEP = 4
@@ -41,7 +40,7 @@ class FollowedMotion:
             smoothed, rates = smooth_from_the_start(x, 0, samples, M, sample_rate)
             self._motions.append((samples, smoothed, layout.speeds(smoothed, rates)))
 
-    def states(self, model: Model, number: int, at: NDArray[np.int64] | None = None) -> Array:
+    def states(self, model: Model, number: int, at: Indices | None = None) -> Array:
         """Internal states (K, n_states) of a model at samples `at` (K,) of a segment, at all of them unless given.
 
         They begin at rest with the segment, and stay as they are at its ends, where the motion is not known.

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.diagnosis.candidate_fits import Key
 from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.evidence import least_squares_without
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Rows without a torque whose terms are smaller than this share of their usual size have drawn the parameters to zero.
 SHRUNK = 0.1
@@ -59,7 +58,7 @@ class HeldOutRows(CandidateRows):
             left[:, sized] *= np.sqrt(self._usual[sized] / terms[sized])
         return left
 
-    def _shrunk(self, terms: Array) -> NDArray[np.bool_]:
+    def _shrunk(self, terms: Array) -> Mask:
         """Speeds (n_v,) whose rows have no torque and terms of these sums of squares (n_v,) that are far too small."""
         return np.asarray(self._scale.homogeneous & (terms < SHRUNK**2 * self._usual))
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.episodes import Episode, SearchAnswer, discrepancy, episode_document, line
@@ -29,6 +28,7 @@ from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
+from sms_online.stream import Mask
 from sms_online.trackers.information import Information
 from sms_online.verdict.evidence import Discrepancy
 
@@ -299,7 +299,7 @@ class OnlineDiagnosis(Observer):
         """Remembered samples from one grid index to another, cut at gaps; those too short for a window left out."""
         out = []
         for each in joined(self._record).values():
-            inside: NDArray[np.bool_] = (each.index >= first) & (True if last is None else each.index <= last)
+            inside: Mask = (each.index >= first) & (True if last is None else each.index <= last)
             if int(inside.sum()) > least_samples(self._estimator.system):
                 out.append(Segment(each.index[inside], each.values[inside]))
         return out

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # What is kept at most, s: twenty minutes of a planar arm at 1 kHz are 200 MB, and no effect needs more to be found.
 LONGEST = 1200.0
@@ -24,7 +23,7 @@ MOST_WINDOWS, STRETCH = 2500, 5.0
 class Segment:
     """Grid samples without a gap: index (N,) on the session's grid, values (N, channels), SI units."""
 
-    index: NDArray[np.int64]
+    index: Indices
     values: Array
 
 

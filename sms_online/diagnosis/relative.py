@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.channels import Motion
 from sms_online.calibration.joints import JointCalibration
@@ -15,7 +14,7 @@ from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.rows import SessionRows, joint_windows
 from sms_online.diagnosis.weak_windows import SeenMotion, WeakWindows
 from sms_online.row_types import joint_rows
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 
 class RelativeResiduals:
@@ -82,7 +81,7 @@ class RelativeResiduals:
         """Effects whose coefficients a solution holds after the model's parameters, in this order."""
         self._effects = [self._make.of(effect).columns[:, self._joints] for effect in effects]
 
-    def of(self, solution: Array, held: Iterable[tuple[NDArray[np.bool_], Array]] = ()) -> dict[str, float]:
+    def of(self, solution: Array, held: Iterable[tuple[Mask, Array]] = ()) -> dict[str, float]:
         """By joint, for a solution (n + c + m,); held: windows (W,) that another solution predicts.
 
         Calibration is that of deflections and torques.

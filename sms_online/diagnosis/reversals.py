@@ -23,7 +23,7 @@ from sms_online.effects.base import STANDSTILL, position
 from sms_online.pipeline.rough_forces import WITHIN
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # What these leave of a jump's place, samples: they are a fifth apart.
 RESOLVED = 0.2 / np.sqrt(12.0)
@@ -85,7 +85,7 @@ class Reversals:
         known = self._known[M][segment]
         return np.asarray(np.interp(at, np.arange(known.size) + M, known))
 
-    def _turns(self, segment: int, samples: NDArray[np.int64], M: int) -> tuple[NDArray[np.intp], Array]:
+    def _turns(self, segment: int, samples: Indices, M: int) -> tuple[NDArray[np.intp], Array]:
         """Which of some samples (K,) are the last before a reversal (R,), and what those are off by (R,), samples.
 
         By noise and by what the filter rounds off. That is in proportion to its width: one of twice the width rounds

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.diagnosis.evidence import least_squares
 from sms_online.diagnosis.record import Segment, excerpts
@@ -24,7 +23,7 @@ from sms_online.model.effect import Inputs
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import EXPONENT
 from sms_online.pipeline.smoothing import HALF_WIDTHS, stride
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # Windows overlap by half.
 HALVES = 2
@@ -124,7 +123,7 @@ class RoughRows:
         # Without nominal values it is not known what counts as much.
         largest = np.sqrt(np.mean(np.sum(self._Y**2, axis=2), axis=0))
         self._size: Array = np.asarray(np.where(stated > 0.0, stated, largest))
-        self._used: NDArray[np.int64] = np.flatnonzero(self._size > LEAST_SIZE * self._size.max())
+        self._used: Indices = np.flatnonzero(self._size > LEAST_SIZE * self._size.max())
         self._size = np.maximum(self._size, LEAST_SIZE * self._size.max())
         self.for_each = count * self._used.size / (base.n + LAWS * len(self._motors))
 
@@ -160,7 +159,7 @@ class RoughRows:
         solution, left = self._free(self._torque * scale, size, every, every, near, start=start)
         return RoughFit(solution[: near.size], left, self._by_nominal(self._torque * scale - self._known, size))
 
-    def shares(self, fitted: NDArray[np.bool_]) -> Array:
+    def shares(self, fitted: Mask) -> Array:
         """rms shares (rows,) of what a fit of some windows (W,) leaves of the others.
 
         Of rows without a torque a share of the size of their terms, which no scale of the parameters changes.
@@ -191,8 +190,8 @@ class RoughRows:
         self,
         torque: Array,
         size: Array,
-        fitted: NDArray[np.bool_],
-        others: NDArray[np.bool_],
+        fitted: Mask,
+        others: Mask,
         near: Array,
         beside: Array | None = None,
         start: Array | None = None,

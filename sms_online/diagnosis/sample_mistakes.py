@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.channels import channel_unit
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.sample_faults import stuck_samples, wrapped_at
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 DEGREE = math.pi / 180.0
 # Values that repeat in runs of at least this length, most of which are equal, are those of a held command.
@@ -254,7 +253,7 @@ def _stuck(
             )
 
 
-def _moves(when: Sequence[NDArray[np.bool_]], readings: Sequence[Array]) -> bool:
+def _moves(when: Sequence[Mask], readings: Sequence[Array]) -> bool:
     """Whether any of some readings (B, c) of segments moves at times (B,): else the arm is at rest."""
     speed = np.concatenate([np.abs(np.diff(each, axis=0, prepend=each[:1])) for each in readings])
     then = np.concatenate(when)

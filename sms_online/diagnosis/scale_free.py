@@ -16,11 +16,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from sms_online.diagnosis.evidence import bounded
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Fits about the solution before, at most, and halvings of a step that does not lower what is asked for.
 FITS, HALVINGS = 16, 6
@@ -35,7 +34,7 @@ LARGEST_ATTENUATION = 1.0
 class HomogeneousRows:
     """Frees some speeds' rows (W, n_v, n) of a model."""
 
-    def __init__(self, Y: Array, speeds: Sequence[int], inertial: NDArray[np.bool_]) -> None:
+    def __init__(self, Y: Array, speeds: Sequence[int], inertial: Mask) -> None:
         """inertial (n,): which columns are inertial forces: they may cancel each other, and so count as one."""
         same = np.outer(inertial, inertial) | np.eye(inertial.size, dtype=bool)
         self._Y = Y
@@ -58,9 +57,7 @@ class HomogeneousRows:
             added[:, speed] = left[:, speed]
         return columns, added
 
-    def solved(
-        self, beside: Array, b: Array, start: Array, near: Array, least: float, positive: NDArray[np.bool_]
-    ) -> Array:
+    def solved(self, beside: Array, b: Array, start: Array, near: Array, least: float, positive: Mask) -> Array:
         """Solution (n + c,) of rows b (W, n_v) with columns beside (W, n_v, c), weighted by what each speed leaves.
 
         start, near (n,): parameters to begin with, and those that rows which determine nothing else stay near. least:
@@ -128,7 +125,7 @@ class Scale:
     added, and not by attenuation alone.
     """
 
-    def __init__(self, b: Array, expected: Array, inertial: NDArray[np.bool_], known: bool) -> None:
+    def __init__(self, b: Array, expected: Array, inertial: Mask, known: bool) -> None:
         """b (W, n_v): torques of the rows. expected (n,): parameters behind their weights. known: a prior gives it."""
         self.homogeneous = ~np.any(b, axis=0)
         self.unknown = not known and bool(expected.any()) and bool(self.homogeneous.any())
@@ -159,7 +156,7 @@ class Scale:
         noise = float(len(terms) * np.count_nonzero(self.homogeneous))
         return float(noise / np.sqrt(noise + np.sum(terms[:, ~self.homogeneous] ** 2)))
 
-    def fit(self, Y: Array, beside: Array, b: Array, positive: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    def fit(self, Y: Array, beside: Array, b: Array, positive: Mask) -> tuple[Array, Array, Array]:
         """Solution (n + c,) of rows b (W, n_v) with columns (W, n_v, n) and beside (W, n_v, c), and what it leaves.
 
         Each type of rows counts by what it leaves, those without a torque by their size. Mean squares (n_v,), then the

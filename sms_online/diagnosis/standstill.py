@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.diagnosis.record import Segment
 from sms_online.effects.base import position
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.standstill import Standstill, rate_filter
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # Before breakaway an axis is held by what its law gives so long before its motion shows, s.
 LEAVING = 0.025
@@ -42,16 +41,16 @@ class SessionStandstill:
         """Share of the session in which the axis is at rest."""
         return float(np.mean(np.concatenate(self._still)))
 
-    def at(self, number: int, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def at(self, number: int, samples: Indices) -> Mask:
         """At which samples (K,) of a segment the axis is at rest."""
         return self._still[number][samples]
 
-    def leaving(self, number: int, samples: NDArray[np.int64]) -> Array:
+    def leaving(self, number: int, samples: Indices) -> Array:
         """Sign (K,) of the motion after breakaway at samples (K,) just before it, zero elsewhere."""
         return self._leaving[number][samples]
 
 
-def _leaving(still: NDArray[np.bool_], angle: Array, sample_rate: float) -> Array:
+def _leaving(still: Mask, angle: Array, sample_rate: float) -> Array:
     """See `SessionStandstill.leaving`, for all samples of a segment."""
     out = np.zeros(still.size)
     beyond = rate_filter(sample_rate)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
 from sms_online.diagnosis.record import Segment
@@ -17,7 +16,7 @@ from sms_online.pipeline.row_noise import common
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import kernel, smooth, smooth_all
 from sms_online.pipeline.weak_form import effective_samples, test_function
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class SeenMotion:
 
     segment: int
     half_width: int
-    samples: NDArray[np.int64]
+    samples: Indices
     x: Array
     v: Array
     torque: Array
@@ -48,9 +47,9 @@ class WindowPlaces:
     first to last. exponent: of the test function (1 - z²)^exponent. stride: gives for M to take one sample in so many.
     """
 
-    segment: NDArray[np.int64]
-    start: NDArray[np.int64]
-    half_width: NDArray[np.int64]
+    segment: Indices
+    start: Indices
+    half_width: Indices
     width: int
     exponent: int
     stride: Callable[[int], int]
@@ -68,7 +67,7 @@ class WeakWindows:
             np.concatenate((sensing.coordinates(segment.values), sensing.inputs(segment.values)), axis=1)
             for segment in segments
         ]
-        self._motions: dict[bool, list[tuple[SeenMotion, NDArray[np.int64]]]] = {}
+        self._motions: dict[bool, list[tuple[SeenMotion, Indices]]] = {}
         self._operators: dict[bool, list[tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]]] = {}
 
     @property
@@ -76,7 +75,7 @@ class WeakWindows:
         """Number of windows W."""
         return self.windows.start.size
 
-    def motions(self, dense: bool = False) -> list[tuple[SeenMotion, NDArray[np.int64]]]:
+    def motions(self, dense: bool = False) -> list[tuple[SeenMotion, Indices]]:
         """Motion of each segment and filter width, and the numbers of the windows that see it; dense: every sample."""
         if dense not in self._motions:
             self._motions[dense] = [
@@ -89,7 +88,7 @@ class WeakWindows:
     def _step(self, M: int, dense: bool) -> int:
         return 1 if dense else self.windows.stride(M)
 
-    def _motion(self, number: int, M: int, dense: bool) -> tuple[SeenMotion, NDArray[np.int64]]:
+    def _motion(self, number: int, M: int, dense: bool) -> tuple[SeenMotion, Indices]:
         w, n_x = self.windows, self._layout.n_x
         signals = self._signals[number]
         which = np.flatnonzero((w.segment == number) & (w.half_width == M))
@@ -181,7 +180,7 @@ class WeakWindows:
         return self._operators[dense]
 
     def _sum(
-        self, motion: SeenMotion, which: NDArray[np.int64], dense: bool
+        self, motion: SeenMotion, which: Indices, dense: bool
     ) -> tuple[scipy.sparse.csr_array, scipy.sparse.csr_array]:
         w = self.windows
         step = self._step(int(w.half_width[which[0]]), dense)

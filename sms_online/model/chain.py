@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.bodies import FlexibleLink, Joint, RigidLink
 from sms_online.description.schema import System
@@ -25,7 +24,7 @@ from sms_online.model.beam import LinearLink
 from sms_online.model.flexible import LinkKinematics, Shape, ShapeRate
 from sms_online.model.layout import Layout
 from sms_online.model.rod import ExactRod
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ class Chain:
         place = len(self.links) if link == BASE else -self.tree.outwards.index(link)
         return place, -frame
 
-    def moving(self, frames: Iterable[int]) -> NDArray[np.bool_]:
+    def moving(self, frames: Iterable[int]) -> Mask:
         """Which speeds (n_v,) move what sits in some frames, but for speeds of its own."""
         layout = self.layout
         mask = np.zeros(layout.n_v, dtype=bool)

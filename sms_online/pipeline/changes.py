@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import Nuisance, known_beforehand
 from sms_online.description.schema import Effect, TrackerChoice
@@ -32,7 +31,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 from sms_online.trackers.information import Information
 from sms_online.trackers.interface import Prior, joined
 
@@ -84,7 +83,7 @@ class ChangesState(State):
     reference: values of the model's parameters by name whose masses adopted effects act on.
     """
 
-    index: NDArray[np.int64]
+    index: Indices
     values: Array
     events: list[Event] = msgspec.field(default_factory=list)
     shifts: list[ClockShift] = msgspec.field(default_factory=list)

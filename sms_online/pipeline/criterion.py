@@ -27,13 +27,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.pipeline.prior_information import WIDENED, Penalty, PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Directions of scaled columns with less information than this share of the largest are rounding, and not moved along.
 # Where one joint's torque alone fixes the scale and its rows leave much, they say 1e-10 of what other rows do, or less.
@@ -59,9 +58,9 @@ class Columns:
 
     nuisances: int
     gains: tuple[int, ...]
-    inertial: NDArray[np.bool_]
+    inertial: Mask
 
-    def sharing(self, torque: bool) -> NDArray[np.bool_]:
+    def sharing(self, torque: bool) -> Mask:
         """Which columns (m + n + 1,) of rows with a torque, or of others, share their error.
 
         All inertial forces follow from the same accelerations, and may cancel each other. Where a torque is, it is all
@@ -74,12 +73,12 @@ class Columns:
         return own
 
     @property
-    def apart(self) -> NDArray[np.bool_]:
+    def apart(self) -> Mask:
         """Which (m + n + 1,) have an error of their own in rows without a torque. Nuisances have none."""
         forces = np.arange(self.inertial.size + 1) >= self.nuisances
         return np.asarray(forces & ~self.sharing(torque=False))
 
-    def same(self, torque: bool) -> NDArray[np.bool_]:
+    def same(self, torque: bool) -> Mask:
         """Which pairs (m + n + 1, m + n + 1) have the same error."""
         sharing = self.sharing(torque)
         pairs = np.outer(sharing, sharing)
@@ -131,8 +130,8 @@ class Criterion:
     def __init__(
         self,
         grams: RowGrams,
-        lacking: NDArray[np.bool_],
-        torque: NDArray[np.bool_],
+        lacking: Mask,
+        torque: Mask,
         columns: Columns,
         start: Array,
         lasting: Array | None = None,
@@ -177,7 +176,7 @@ class Criterion:
         """Sums of squares (n_v,) of the columns that the model may lack a share of."""
         return self._spread(at.M @ at.w[self._wrong], self._lacking)
 
-    def _spread(self, values: Array, rows: NDArray[np.bool_]) -> Array:
+    def _spread(self, values: Array, rows: Mask) -> Array:
         """Values of some rows (·, …) among zeros of all (n_v, …)."""
         out = np.zeros((rows.size, *values.shape[1:]))
         out[rows] = values
@@ -276,8 +275,8 @@ class Criterion:
 
 def minimum(
     grams: RowGrams,
-    lacking: NDArray[np.bool_],
-    torque: NDArray[np.bool_],
+    lacking: Mask,
+    torque: Mask,
     starts: list[Array],
     columns: Columns,
     known: PriorInformation,

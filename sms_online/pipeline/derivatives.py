@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.geometry import STEP, Geometry, same_readings
 from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.model.so3 import skew
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Step of the differences by displacements, m and rad: 1e-8 of a derivative is lost to curvature, as much to rounding.
 DIFFERENCE = 1e-6
@@ -42,9 +41,7 @@ class Derivatives:
             self._stacked = self._model.stacked(self._models, repeats).dynamics(pi)
             self._each = [model.dynamics(pi) for model in self._models]
 
-    def at(
-        self, pi: Array, x: Array, v: Array, signals: Array | None, H: Array, chosen: NDArray[np.bool_]
-    ) -> tuple[Array, Array]:
+    def at(self, pi: Array, x: Array, v: Array, signals: Array | None, H: Array, chosen: Mask) -> tuple[Array, Array]:
         """∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x side by side (·, n_v, 3 n_v) at the chosen ones of K states, K of them or fewer;
         and ∂Pπ and ∂Gπ (2, K, n_v, c) by geometries, readings staying as they are.
 
@@ -113,7 +110,7 @@ class Derivatives:
 
 def _effects(
     dynamics: Dynamics, x: Array, v: Array, displaced: Array, steps: Array, signals: Array | None,
-    chosen: NDArray[np.bool_],
+    chosen: Mask,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Derivatives (K, n_v, n_v) of the effects' forces by speeds and by displacements, at x (K, n_x), v (K, n_v).
 

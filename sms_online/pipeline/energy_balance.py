@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # Rows a second: the balance's own frequencies stay below some 20 Hz; denser rows repeat each other's noise.
 ROW_RATE = 50.0
@@ -41,7 +40,7 @@ class BalanceRows:
 
     Y: Array
     b: Array
-    index: NDArray[np.int64]
+    index: Indices
 
 
 class SharedErrors(State):
@@ -142,7 +141,7 @@ class EnergyBalance(Stage):
 
     def push(
         self,
-        index: NDArray[np.int64],
+        index: Indices,
         x: Array,
         v: Array,
         signals: Array,
@@ -197,7 +196,7 @@ class EnergyBalance(Stage):
         self.state.window_start = start
         return self._rows(differences[reported], grid[reported])
 
-    def _rows(self, differences: Array, ends: NDArray[np.int64]) -> BalanceRows:
+    def _rows(self, differences: Array, ends: Indices) -> BalanceRows:
         columns = differences[:, :-1]
         b = differences[:, -1] - self.base.known_part(columns)
         return BalanceRows(self.base.columns(columns), b, ends)

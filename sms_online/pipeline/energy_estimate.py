@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -11,7 +10,7 @@ from sms_online.pipeline.energy_balance import EnergyBalance, SharedErrors
 from sms_online.pipeline.joint_balance import JointBalance, SquaredResidual
 from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 from sms_online.trackers.interface import Prior, Rows, Tracker
 from sms_online.trackers.square_root import session_tracker
 
@@ -62,7 +61,7 @@ class EnergyEstimate(Stage):
 
     def push(
         self,
-        index: NDArray[np.int64],
+        index: Indices,
         segment: int,
         x: Array,
         v: Array,

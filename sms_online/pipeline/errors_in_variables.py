@@ -14,11 +14,10 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from sms_online.state import State
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.trackers.interface import Estimate
 
 # Windows that share samples answer for noise together; a cluster is of windows side by side.
@@ -75,7 +74,7 @@ class NoiseBias(State):
         """All of them (C, n + 1, n + 1), in order of time."""
         return np.array(self.whole if self.joined == 0 else [*self.whole, self.last]).reshape(-1, *self.gram.shape)
 
-    def correction(self, determined: NDArray[np.bool_], lost_unknown: bool = False) -> tuple[Array, Array]:
+    def correction(self, determined: Mask, lost_unknown: bool = False) -> tuple[Array, Array]:
         """What to add to the least-squares estimate (n,) to free it of this bias, and to its covariance (n, n).
 
         The synthetic noise is one sample, so the shift scatters. As much of it is given as is no scatter: a bias that

@@ -6,14 +6,13 @@ from collections.abc import Iterable
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from sms_online.model.model import Model
 from sms_online.pipeline.events import Seen
 from sms_online.pipeline.momentum_windows import EXPONENT, INSTANTS
 from sms_online.pipeline.smoothing import smooth
 from sms_online.pipeline.weak_form import test_function
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # Half width of the filter, samples: that of a motion with a jolt in it.
 HALF_WIDTH = 20
@@ -28,7 +27,7 @@ def event_instant(
     jump: Array,
     beta: Array,
     windows: Iterable[Seen],
-    index: NDArray[np.int64],
+    index: Indices,
     x: Array,
     signals: Array,
     between: tuple[int, int],

@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.criterion import Columns, minimum
 from sms_online.pipeline.plain_rows import PlainRows
 from sms_online.pipeline.prior_information import PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
 from sms_online.pipeline.white_rows import WhiteRows
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Weighted fits of the windows held back before their rows are handed on.
 PASSES = 2
@@ -45,8 +44,8 @@ class FirstWeights:
         nominal: Array,
         calibration: Array,
         columns: Columns,
-        torque: NDArray[np.bool_],
-        gained: NDArray[np.bool_],
+        torque: Mask,
+        gained: Mask,
         prior_information: Callable[[], PriorInformation],
     ) -> None:
         self._nominal, self._calibration = nominal, calibration
@@ -111,7 +110,7 @@ class FirstWeights:
             lacking, starts = (plain.misfit > 0.0) | self._gained, [joint]
         return self._least(grams, lacking, starts)[m:]
 
-    def _least(self, grams: RowGrams, lacking: NDArray[np.bool_], starts: list[Array]) -> Array:
+    def _least(self, grams: RowGrams, lacking: Mask, starts: list[Array]) -> Array:
         """Nuisances and β (m + n,) of the minimum as far as the rows determine them, else the described values.
 
         Noise that follows a parameter which rows do not determine may be any.
@@ -122,7 +121,7 @@ class FirstWeights:
         return np.where(determined, found.beta, np.pad(self._nominal, (self._nuisances, 0)))
 
 
-def _least_squares(rows: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _least_squares(rows: Array) -> tuple[Array, Mask]:
     """Least-squares solution (n,) of rows [Y b] (M, n + 1) of unit variance, and where they determine it.
 
     Of minimum norm in units of the columns' sizes.

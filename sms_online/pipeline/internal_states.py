@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.model.model import Model
@@ -20,7 +19,7 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.smoothing import HALF_WIDTHS, smooth
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # Half width of the filter of the motion behind the states, s, which passes 50 Hz: a hysteresis forgets with every way
 # that its spring goes, noise's too. Of short windows it is this multiple at most.
@@ -32,9 +31,7 @@ def half_width(system: System) -> int:
     return max(HALF_WIDTHS[0], round(min(HALF_WIDTH, OF_WINDOW * system.windows.momentum) * system.sample_rate))
 
 
-def smooth_from_the_start(
-    x: Array, first: int, samples: NDArray[np.int64], M: int, sample_rate: float
-) -> tuple[Array, Array]:
+def smooth_from_the_start(x: Array, first: int, samples: Indices, M: int, sample_rate: float) -> tuple[Array, Array]:
     """The same as `smooth` with half width M, but near the beginning with as much of the ladder of widths as it allows.
 
     A mass that rings keeps for good what it has missed of a motion's beginning. first: number of the first of x (B, ·)

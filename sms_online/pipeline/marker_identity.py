@@ -12,17 +12,13 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from sms_online.model.model import Model
 from sms_online.model.points import Points
 from sms_online.pipeline.sensing import Sensing
 from sms_online.state import Stage, State
-from sms_online.stream import Array
-
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from sms_online.stream import Array, Indices, Mask
 
 # A sample within this distance of its prediction, m, is its marker's: at 240 Hz 1 m/s moves it by 4 mm. Markers that
 # come nearer to each other than this are never relabelled.

@@ -13,7 +13,6 @@ from operator import itemgetter
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import RANDOM_SEED, RANK_TOLERANCE, BaseParameters, random_inputs, random_states
 from sms_online.model.model import Model
@@ -32,7 +31,7 @@ from sms_online.pipeline.smoothing import HALF_WIDTHS, WidthChoice, smooth, stri
 from sms_online.pipeline.standstill import Standstill
 from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # Random states that show which entries of a row are zero by structure.
 PATTERN_STATES = 8
@@ -50,7 +49,7 @@ PROMPT_SHARE = HOPS
 MARGIN = HALF_WIDTHS[-1]
 
 
-def momentum_pattern(model: Model) -> NDArray[np.bool_]:
+def momentum_pattern(model: Model) -> Mask:
     """Entries (n_v, n_pi) of a weak-form row that the structure of the model does not make zero."""
     rng = np.random.default_rng(RANDOM_SEED)
     x, v = random_states(model, PATTERN_STATES, rng)
@@ -153,7 +152,7 @@ class MomentumBalance(Stage):
         self._standstill = Standstill(self._dry.size, self.sample_rate)
 
     def push(
-        self, index: NDArray[np.int64], copies: list[Array], sigma: Array, lateness: Array | None = None
+        self, index: Indices, copies: list[Array], sigma: Array, lateness: Array | None = None
     ) -> tuple[list[Window], list[Instants]]:
         """Windows that B consecutive samples complete, and the states at their instants.
 
@@ -219,7 +218,7 @@ class MomentumBalance(Stage):
             v[0] = self.model.layout.speeds(x[0], self._differences(numbers))
         return [Instants(int(numbers[0]), x[0], v[0], signals[0])]
 
-    def _differences(self, numbers: NDArray[np.int64]) -> Array:
+    def _differences(self, numbers: Indices) -> Array:
         """Rates (K, n_x) of x at instants, from what it is halfway between them, by differences of fourth order.
 
         Noise of rates that are smoothed each for itself does not add up to that of a motion in a sum over instants:
@@ -349,7 +348,7 @@ class MomentumBalance(Stage):
         copies = COPIES if np.any(x[1] != x[0]) else 1
         return [part[:copies].reshape(-1, part.shape[2]) for part in (x, v, signals)], x.shape[1]
 
-    def _packed(self, part: Array, entries: NDArray[np.int64], K: int) -> Array:
+    def _packed(self, part: Array, entries: Indices, K: int) -> Array:
         """Entries of columns at the states of `_distinct`, and what is known of them, for every copy: (K, entries)."""
         own = part[:, self.rows[entries], self._physical[entries]]
         both = np.concatenate((own, self.base.known_part(part)), axis=1)

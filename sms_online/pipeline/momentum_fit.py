@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -41,7 +40,7 @@ from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.window_noise import WindowNoise
 from sms_online.pipeline.window_whitening import WhitenedWindow, WindowWhitening
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Motion before weights are made, s: at the usual width, four windows side by side.
 FIRST_MOTION = 1.6
@@ -299,7 +298,7 @@ class MomentumFit(Stage):
             whitening.noise.extend(self.state.first, self.state.x, self.state.v, self.state.signals)
 
     @property
-    def lacking(self) -> NDArray[np.bool_]:
+    def lacking(self) -> Mask:
         """Which speeds' rows (n_v,) are weighted by what they leave: more than noise, or a torque of unknown gain."""
         return np.asarray((self.plain.misfit > 0.0) | self._gained)
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 
 class Observer:
@@ -15,7 +12,7 @@ class Observer:
     def samples(self, piece: GridSamples) -> None:
         """Grid samples of the channels that the model reads, as the synchroniser gives them."""
 
-    def motion(self, index: NDArray[np.int64], segment: int, x: Array, v: Array, inputs: Array) -> None:
+    def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array) -> None:
         """Consecutive smoothed samples: grid index (B,), number of the segment, x (B, n_x), v (B, n_v).
 
         inputs (B, inputs): n τ and measured wrenches.

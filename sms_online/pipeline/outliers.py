@@ -14,11 +14,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.noise import NORMAL_MAD
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # A sample off by so many robust deviations is an outlier: of white noise one sample in 10⁸ is.
 OUTLIER = 6.0
@@ -60,8 +59,8 @@ class OutlierState(State):
     deviation: Array
     weight: Array
     step: Array
-    left_out: NDArray[np.int64]
-    judged: NDArray[np.int64]
+    left_out: Indices
+    judged: Indices
     first: Array
 
 
@@ -72,7 +71,7 @@ class Outliers(Stage):
     """
 
     def __init__(self, channels: int, columns: Sequence[int]) -> None:
-        self._columns: NDArray[np.int64] = np.array(columns, dtype=np.int64)
+        self._columns: Indices = np.array(columns, dtype=np.int64)
         none = np.zeros(channels, dtype=np.int64)
         empty, unknown = np.empty((0, channels)), np.zeros(channels)
         never = np.full(channels, np.inf)
@@ -105,7 +104,7 @@ class Outliers(Stage):
         now.time, now.values, now.passed = time[needed:], kept[needed:], max(0, end - needed)
         return out
 
-    def _sampled_together(self, values: Array) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def _sampled_together(self, values: Array) -> list[tuple[Indices, Indices]]:
         """Columns with samples in the same rows, and these rows."""
         present = ~np.isnan(values[:, self._columns])
         if present.all():
@@ -116,12 +115,12 @@ class Outliers(Stage):
         found = [(self._columns[own], np.flatnonzero(present[:, own[0]])) for own in members.values()]
         return [(columns, rows) for columns, rows in found if rows.size]
 
-    def _judged_up_to(self, time: Array, groups: Sequence[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> int:
+    def _judged_up_to(self, time: Array, groups: Sequence[tuple[Indices, Indices]]) -> int:
         """Rows whose samples are followed by as many as it takes, or have waited long enough."""
         waiting = [int(rows[-SIDE]) for _, rows in groups if rows.size >= SIDE]
         return max(min(waiting, default=time.size), int(np.searchsorted(time, time[-1] - PATIENCE)))
 
-    def _judge(self, time: Array, values: Array, columns: NDArray[np.int64], rows: NDArray[np.int64], end: int) -> None:
+    def _judge(self, time: Array, values: Array, columns: Indices, rows: Indices, end: int) -> None:
         """Write NaN over the outliers of some columns, with samples in some rows, up to row `end`."""
         now = self.state
         own = slice(int(np.searchsorted(rows, now.passed)), int(np.searchsorted(rows, end)))
@@ -172,7 +171,7 @@ def _off(t: Array, samples: Array) -> Array:
     return out
 
 
-def _outliers(t: Array, samples: Array, least: float, own: slice) -> NDArray[np.int64]:
+def _outliers(t: Array, samples: Array, least: float, own: slice) -> Indices:
     """Places of the outliers among samples (B,) at times t (B,) of one channel, of those in `own`.
 
     least: by which they are off.

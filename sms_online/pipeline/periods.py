@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # First intervals of a channel whose median is its period: four of nine may be disturbed.
 PERIOD_INTERVALS = 9
@@ -62,7 +61,7 @@ class Periods(Stage):
             self.state.known = self.state.known.copy()
             self.state.known[channel] = np.nanmedian(first)
 
-    def is_gap(self, interval: Array, channel: int) -> NDArray[np.bool_]:
+    def is_gap(self, interval: Array, channel: int) -> Mask:
         """Which intervals are gaps. Before the period is known only the absolute limit decides."""
         gap = interval > LONGEST_HOLE
         period = self.state.known[channel]

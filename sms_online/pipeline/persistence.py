@@ -10,11 +10,10 @@ from math import ceil
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Windows from one to another that are compared: from the nearest whose noise is independent, for samples at the ends of
 # a window count little, to three times as far.
@@ -50,7 +49,7 @@ class Persistence(Stage):
         """Whether there are windows enough to show whether what they leave lasts."""
         return len(self.state.rows) >= LEAST_WINDOWS
 
-    def passing(self, beta: Array) -> NDArray[np.bool_]:
+    def passing(self, beta: Array) -> Mask:
         """Of which rows (k,) what is left by nuisances and parameters β (m + n,) is shown not to last."""
         if not self.decides:
             return np.zeros(len(self.state.rows[0]) if self.state.rows else 0, dtype=np.bool_)

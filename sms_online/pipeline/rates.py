@@ -20,13 +20,12 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
 from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 DEGREE = 8
 # Half widths M in samples, each about √2 times the one before (noise of the rate down by 1.75 a step). All pass DC
@@ -70,7 +69,7 @@ class RateSamples:
     segment: number of the gap-free segment. half_width: M of the filter they passed, for the propagation of noise.
     """
 
-    index: NDArray[np.int64]
+    index: Indices
     values: Array
     rates: Array
     segment: int

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import BOUND, Nuisance
 from sms_online.calibration.release import at_most_tolerances, release_gain
@@ -30,7 +29,7 @@ from sms_online.pipeline.persistence import Persistence
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.row_types import row_types
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # False alarms an hour, at most: one in a hundred hours of motion.
 FALSE_ALARMS = 0.01
@@ -66,7 +65,7 @@ class TestState(State):
     """
 
     sums: Array
-    since: NDArray[np.int64]
+    since: Indices
     beta: Array
     scale: Array
     root: Array
@@ -89,7 +88,7 @@ class SequentialTest(Stage):
     ) -> None:
         self._layout, self._clocks = layout, list(clocks)
         tolerances = np.array([each.tolerance if each.may_give_way else np.inf for each in nuisances])
-        self._loose: NDArray[np.int64] = np.flatnonzero(np.isfinite(tolerances))
+        self._loose: Indices = np.flatnonzero(np.isfinite(tolerances))
         self._tolerances: Array = tolerances[self._loose]
         self._types = {name: speeds for name, speeds in row_types(layout).items() if len(speeds) > 1}
         tests = layout.n_v + len(self._types)

@@ -12,14 +12,13 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.effects.base import STANDSTILL, joints_of
 from sms_online.model.model import Model
 from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.pipeline.smoothing import kernel
 from sms_online.pipeline.weak_form import effective_samples
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # Step of the differences that give slopes, rad and rad/s (m, m/s): 1e-9 of a force is lost to curvature where a phase
 # turns 300 times as fast as its joint, and as much to rounding.
@@ -57,7 +56,7 @@ class RoughForces:
         dry = [(axis, place) for k, axis in self._dry for place in self._places(k).tolist()]
         self.axes, self.dry = np.array(dry, dtype=np.int64).reshape(-1, 2).T
 
-    def _places(self, k: int) -> NDArray[np.int64]:
+    def _places(self, k: int) -> Indices:
         columns = self._model.effect_slices[k]
         return np.arange(columns.start, columns.stop, dtype=np.int64)
 
@@ -143,7 +142,7 @@ class RoughForces:
         return out
 
 
-def stiction_std(breaking: Array, still: NDArray[np.bool_], phi: Array) -> Array:
+def stiction_std(breaking: Array, still: Mask, phi: Array) -> Array:
     """Standard deviation (INSTANTS, D) of the integrals of forces where their axes rest, a half hop at a time.
 
     As of a force that is another at each sample, so that nothing predicts its course; over a window, all of which

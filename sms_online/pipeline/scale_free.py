@@ -22,13 +22,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from sms_online.pipeline.criterion import Columns, Criterion, Minimum, at_minimum, descended, minimum
 from sms_online.pipeline.prior_information import Penalty, PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.trackers.factor import masked_covariance
 from sms_online.trackers.interface import Estimate
 
@@ -48,8 +47,8 @@ class ScaleFree:
     """
 
     grams: RowGrams
-    lacking: NDArray[np.bool_]
-    torque: NDArray[np.bool_]
+    lacking: Mask
+    torque: Mask
     weights: Array
     columns: Columns
     known: PriorInformation
@@ -112,7 +111,7 @@ class ScaleFree:
             scale=None if self.alone else 1.0,
         )
 
-    def _of_blocks(self, known: NDArray[np.bool_]) -> Array:
+    def _of_blocks(self, known: Mask) -> Array:
         """Covariance (n, n) of the minimum from what it is without each block of time; known (n,): what has one.
 
         Infinite where blocks are fewer than two, and where one alone determines a parameter.

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.geometry import Geometry
 from sms_online.model.dynamics import Dynamics
@@ -14,7 +13,7 @@ from sms_online.model.model import Model
 from sms_online.pipeline.derivatives import Derivatives
 from sms_online.pipeline.momentum_windows import INSTANTS
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # Derivatives of the force and of the momentum by displacements, small beside the mass matrix, are computed at
 # every other instant and interpolated: on the planar example with strong noise that costs 3 % in accuracy, doing so
@@ -41,7 +40,7 @@ class Sensitivity:
     displacements: Array
 
 
-def nodes(offset: int) -> NDArray[np.int64]:
+def nodes(offset: int) -> Indices:
     """Instants of a window at which derivatives of the force are computed."""
     return np.arange(offset, INSTANTS + 1, SPARSE)
 
@@ -56,7 +55,7 @@ class SensitivityState(State):
     first: int
     dense: Array
     rates: Array
-    numbers: NDArray[np.int64]
+    numbers: Indices
     derivatives: Array
 
 
@@ -127,7 +126,7 @@ class Sensitivities(Stage):
         """Rates of the readings (count, sensors) at the last instants."""
         return self.state.rates[len(self.state.rates) - count :]
 
-    def windows(self, starts: NDArray[np.int64]) -> Sensitivity:
+    def windows(self, starts: Indices) -> Sensitivity:
         """At the instants from each of some numbers on, all of them even or all of them odd."""
         n_v, now = self.model.layout.n_v, self.state
         inside = (starts - now.first)[:, None] + np.arange(INSTANTS + 1)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.schema import System
 from sms_online.pipeline.clocks import other_clocks, reference_clock
@@ -23,7 +22,7 @@ from sms_online.pipeline.stamp_jitter import (
     pair_sums,
 )
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # A channel's last samples that an estimate takes: 2 % scatter.
 SAMPLES = 4000
@@ -57,7 +56,7 @@ class SensorNoise:
     coordinates: Array
     grid: Array
     exact: bool
-    slow: NDArray[np.bool_]
+    slow: Mask
     coloured: dict[str, float] = field(default_factory=dict)
     jitters: tuple[Jitter, ...] = ()
     lateness: Array | None = None
@@ -187,7 +186,7 @@ class NoiseEstimate(Stage):
             self.state.colour[channel] = count, gain, rate
         return (gain, 1.0 / rate) if correlated > 0.0 or count >= SURE_COLOURS else None
 
-    def _jitters(self, sigma: Array, silent: NDArray[np.int64], period: Array) -> tuple[Jitter, ...]:
+    def _jitters(self, sigma: Array, silent: Indices, period: Array) -> tuple[Jitter, ...]:
         """Jitters of the devices' stamps; noise (channels,) of silent channels becomes what is beside them."""
         positions = np.array(self._sensing.position_columns)
         parts: dict[int, tuple[Array, Array]] = {}

@@ -6,17 +6,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.smoothing import stride
 from sms_online.state import State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # So many samples at once are smoothed and have their columns evaluated: of a long segment they would fill the memory.
 PIECE = 400
 
 # Numbers of samples (K,) and half width of the filter that they pass.
-Samples = Sequence[tuple[NDArray[np.int64], int]]
+Samples = Sequence[tuple[Indices, int]]
 # Evaluates columns at some samples: (K, entries).
 Evaluation = Callable[[Samples], Array]
 

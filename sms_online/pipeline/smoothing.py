@@ -16,10 +16,9 @@ from functools import cache
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 DEGREE = 8
 # Exponent of the weights: side lobes below 1e-4 at twice the band.
@@ -52,14 +51,14 @@ def stride(half_width: int, hop: int) -> int:
     return max(s for s in range(1, max(1, half_width // SAMPLES_A_STEP) + 1) if hop % s == 0)
 
 
-def _windows(samples: Array, length: int, first: NDArray[np.int64]) -> Array:
+def _windows(samples: Array, length: int, first: Indices) -> Array:
     """Runs (n, C, length) of samples (B, C) from rows `first` (n,) on; NumPy's own view for it is slow to make."""
     rows, columns = samples.strides
     shape = len(samples) - length + 1, samples.shape[1], length
     return np.asarray(as_strided(samples, shape, (rows, columns, rows), writeable=False)[first])
 
 
-def smooth(samples: Array, centres: NDArray[np.int64], half_width: int, sample_rate: float) -> tuple[Array, Array]:
+def smooth(samples: Array, centres: Indices, half_width: int, sample_rate: float) -> tuple[Array, Array]:
     """Values and rates (n, C) at `centres` (n,), row numbers of samples (B, C), from M samples on either side."""
     both = _windows(samples, 2 * half_width + 1, centres - half_width) @ kernel(half_width)
     return both[..., 0], both[..., 1] * sample_rate
@@ -84,7 +83,7 @@ class WidthChoice:
         # Variance that unit white noise leaves in each difference.
         self._gain = np.sum(self._differences**2, axis=0)
 
-    def squares(self, samples: Array, centres: NDArray[np.int64]) -> Array:
+    def squares(self, samples: Array, centres: Indices) -> Array:
         """Summed squares (steps, C) of the differences at `centres`, in multiples of unit noise's expectation."""
         widest = self._half_widths[-1]
         windows = _windows(samples, 2 * widest + 1, centres - widest)

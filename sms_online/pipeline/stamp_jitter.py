@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.noise import rough_part
 from sms_online.state import State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 
 # Order of the differences: of a vibration at a tenth of the sample rate they leave a ten-thousandth.
 ORDER = 8
@@ -59,7 +58,7 @@ class JitterState(State):
         """Nothing known of so many sensors."""
         return JitterState(np.zeros((sensors, sensors)), np.zeros((sensors, sensors)))
 
-    def with_sums(self, product: Array, rates: Array, own: NDArray[np.int64]) -> JitterState:
+    def with_sums(self, product: Array, rates: Array, own: Indices) -> JitterState:
         """With sums of some sensors (indices), by which older samples of these count less."""
         pairs = np.ix_(own, own)
         out = JitterState(self.product.copy(), self.rates.copy())

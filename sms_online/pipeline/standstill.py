@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.smoothing import HALF_WIDTHS, kernel, smooth_all
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # An axis is at rest where its rate is below this multiple of the rate's noise for so long, s. At a reversal it is for
 # less, unless it sticks there, or is turned round by less than 1 rad/s² (noise of 1e-4 rad at 1 kHz).
@@ -26,7 +25,7 @@ def slowest(noise: float, half_width: int, sample_rate: float) -> float:
     return STILL * noise * float(np.linalg.norm(kernel(half_width)[:, 1])) * sample_rate
 
 
-def lasting(slow: NDArray[np.bool_], sample_rate: float) -> NDArray[np.bool_]:
+def lasting(slow: Mask, sample_rate: float) -> Mask:
     """Samples at which an axis is slow for long, of samples (K,) at which it is slow."""
     still = np.zeros_like(slow)
     for begin, end in np.flatnonzero(np.diff(slow, prepend=False, append=False)).reshape(-1, 2).tolist():
@@ -41,7 +40,7 @@ class StandstillState(State):
     """
 
     angles: Array
-    still: NDArray[np.bool_]
+    still: Mask
     first: int = 0
 
 
@@ -65,7 +64,7 @@ class Standstill(Stage):
         limits = [slowest(sigma, M, self._rate) for sigma in noise.tolist()]
         self.state.still = np.stack([lasting(slow, self._rate) for slow in (np.abs(rates) < limits).T], axis=1)
 
-    def at(self, samples: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def at(self, samples: Indices) -> Mask:
         """Whether the axes are at rest at samples (K,), (K, D); what is not known yet is as what is known last."""
         now = self.state
         if not len(now.still):

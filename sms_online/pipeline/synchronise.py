@@ -7,14 +7,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.periods import LONGEST_HOLE, Periods
 from sms_online.state import Stage, State
-from sms_online.stream import Array, Block
-
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+from sms_online.stream import Array, Block, Indices, Mask
 
 # A sample this close to a grid point, in grid periods, lies on it. At 1 kHz that is 0.1 µs, in which 1 rad/s moves a
 # hundredth of a good encoder's noise; measured captures round their stamps to 0.03 µs.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.effects.base import joints_of
@@ -13,7 +12,7 @@ from sms_online.effects.catalogue import ENTRIES
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.effect import ForceEffect
 from sms_online.model.model import Model
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 GAIN = "drive_gain"
 
@@ -39,7 +38,7 @@ def plausible_gains(model: Model, base: BaseParameters, m: int) -> Array:
     return rows
 
 
-def gained(model: Model) -> NDArray[np.bool_]:
+def gained(model: Model) -> Mask:
     """Which speeds' rows (n_v,) hold a torque whose gain is an unknown of the model.
 
     Such a row is homogeneous in the gain and in the other parameters: as in the rows of a link, all of them shrinking

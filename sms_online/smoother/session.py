@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -19,7 +18,7 @@ from sms_online.pipeline.synchronise import GridSamples, Synchroniser
 from sms_online.smoother.fit import DivergedError, SpanFit, SpanSmoother
 from sms_online.smoother.span import Ending, Span
 from sms_online.state import Stage, State
-from sms_online.stream import Array, Block
+from sms_online.stream import Array, Block, Indices
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.interface import Estimate, Prior, prior_factor
 
@@ -93,9 +92,9 @@ class SmootherState(State):
     known: SmootherStatistics
     t: Array
     values: Array
-    index: NDArray[np.int64]
+    index: Indices
     torque: Array
-    moved: NDArray[np.int64]
+    moved: Indices
     motion: Array
     sigma: Array
     ending: Ending | None = None
@@ -152,7 +151,7 @@ class Smoother(Stage):
         index = np.stack((piece.index, np.full(piece.index.size, piece.segment)), axis=1)
         now.index, now.torque = np.concatenate((now.index, index)), np.concatenate((now.torque, piece.values))
 
-    def move(self, index: NDArray[np.int64], x: Array, v: Array) -> None:
+    def move(self, index: Indices, x: Array, v: Array) -> None:
         """Take the motion as the sensors alone give it, at grid samples (B,): x (B, n_x), v (B, n_v)."""
         now = self.state
         now.moved = np.concatenate((now.moved, index))
@@ -193,7 +192,7 @@ class Smoother(Stage):
         over = last or run < segment.size or (run >= most and moved >= self.state.index[most - 1, 0])
         return longest if over else 0
 
-    def _time(self, index: NDArray[np.int64]) -> Array:
+    def _time(self, index: Indices) -> Array:
         return np.asarray(self._synchroniser.start_time + index / self._rate)
 
     def _forget(self, count: int) -> None:

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Drift, TrackerChoice
 from sms_online.errors import InputError
 from sms_online.model.parameters import Parameter
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.trackers.drift import LearnedTrend
 from sms_online.trackers.forgetting import Directional, Exponential, Forgetting, NoForgetting, SlidingWindow
 from sms_online.trackers.interface import Prior, Tracker
@@ -136,7 +135,7 @@ def _place(choice: TrackerChoice, key: str = "") -> str:
     return f"tracker {choice.label}" + (f", {key}" if key else "")
 
 
-def _columns(drifts: Sequence[Drift], kind: Drift, nuisances: int) -> NDArray[np.bool_]:
+def _columns(drifts: Sequence[Drift], kind: Drift, nuisances: int) -> Mask:
     """Columns (m + n,) of parameters of one kind of drift."""
     return np.concatenate((np.zeros(nuisances, dtype=np.bool_), [drift == kind for drift in drifts]))
 

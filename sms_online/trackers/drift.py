@@ -20,9 +20,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.trackers.drift_filter import (
     KNOT,
     START,
@@ -341,7 +340,7 @@ class LearnedTrend(Tracker):
         return [column for each in self.state.moving if each.learned for column in each.columns]
 
     @property
-    def moves(self) -> NDArray[np.bool_]:
+    def moves(self) -> Mask:
         """Which parameters (n,) move, by trend or walk."""
         out = self._walks > 0.0
         for each in self.state.moving:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Error bars and bands are drawn so far to either side, in standard deviations.
 BOUNDS = 2.0
@@ -23,4 +20,4 @@ class Known:
     t: float
     estimate: Array
     std: Array
-    determined: NDArray[np.bool_]
+    determined: Mask

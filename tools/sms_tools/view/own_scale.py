@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sms_online.stream import Mask
 from sms_tools.view.frames import Reference
 from sms_tools.view.known import BOUNDS, Known
 from sms_tools.view.parameter_groups import HALF_RANGES, Basis, half_range
@@ -29,7 +29,7 @@ class OwnScale:
     """
 
     def __init__(self, references: Sequence[Reference | None]) -> None:
-        self._compared: NDArray[np.bool_] = np.array([r is None or not r.is_true for r in references], dtype=bool)
+        self._compared: Mask = np.array([r is None or not r.is_true for r in references], dtype=bool)
         nominal = [np.nan if r is None or r.is_true else r.value or np.nan for r in references]
         self.basis = Basis(np.array(nominal), "nominal value", HALF_RANGES[-1])
         self._own = False

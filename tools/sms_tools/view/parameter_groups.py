@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.model.parameters import Parameter
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices
 from sms_tools.view.frames import Reference
 
 # Lines that a person can distinguish in one plot.
@@ -50,7 +49,7 @@ class Group:
     path: str
     kind: str
     title: str
-    indices: NDArray[np.int64]
+    indices: Indices
     labels: tuple[str, ...]
     zero: Array
     scale: Array

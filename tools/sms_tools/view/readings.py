@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sms_online.pipeline.sensing import Sensing
-from sms_online.stream import Array, Block
+from sms_online.stream import Array, Block, Indices
 
 # Pictures of the arm a second of the session: smooth to the eye.
 DISPLAY_RATE = 20.0
@@ -26,7 +25,7 @@ class SampleAndHold:
         values = block.values[:, self._columns]
         if np.isnan(values).any():
             stacked = np.concatenate((self.last[None], values))
-            rows: NDArray[np.int64] = np.where(np.isnan(stacked), 0, np.arange(len(stacked))[:, None])
+            rows: Indices = np.where(np.isnan(stacked), 0, np.arange(len(stacked))[:, None])
             values = np.take_along_axis(stacked, np.maximum.accumulate(rows, axis=0), axis=0)[1:]
         self.last = values[-1]
         return values

@@ -9,12 +9,11 @@ from operator import itemgetter
 
 import numpy as np
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from sms_online.evaluation import identifiable
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import event_document
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 from sms_online.verdict.judged import JudgedEvaluation
 from sms_online.verdict.reasons import LARGEST_RESIDUAL, LARGEST_WHITENED
 from sms_online.verdict.trust import Trust
@@ -79,7 +78,7 @@ class Recorder:
         self._residual = np.full(len(system.joints), np.nan)
         self._recent = RecentResidual()
         self._events = 0  # marked and named so far
-        self._determined: NDArray[np.bool_] = np.zeros(now.base.n, dtype=bool)
+        self._determined: Mask = np.zeros(now.base.n, dtype=bool)
         self._gaps = 0
         self._beyond: set[str] = set()  # plots of residuals in which something was too much
         self._slow_due = -np.inf
