@@ -21,6 +21,7 @@ from sms_adapters.raw import EXTENDED, one_line
 from sms_online.description.explain import nearest
 from sms_online.description.sources import CanSource
 from sms_online.errors import InputError
+from sms_online.grouping import grouped
 from sms_online.stream import Array, Mask
 
 CLASSIC_BYTES = 8  # of a frame that is not CAN FD
@@ -68,9 +69,8 @@ class WantedMessage:
     @property
     def parts(self) -> list[Part]:
         """The signals in groups that come in the same frames."""
-        groups: dict[Condition, list[int]] = {}
-        for k, condition in enumerate(self.conditions or [()] * len(self.signals)):
-            groups.setdefault(condition, []).append(k)
+        conditions = self.conditions or [()] * len(self.signals)
+        groups = grouped((condition, k) for k, condition in enumerate(conditions))
         return [
             Part(tuple(self.signals[k] for k in group), tuple(self.columns[k] for k in group), condition)
             for condition, group in groups.items()
@@ -91,9 +91,10 @@ def wanted_messages(source: CanSource, directory: Path | None) -> list[WantedMes
     place = f"source {source.name}"
     database = _read_dbc(place, source.dbc, directory)
     messages = {message.name: message for message in database.messages}
-    wanted: dict[str, list[tuple[int, Signal]]] = {}
-    for column, name in enumerate(source.signals):
-        wanted.setdefault(name.split(".")[0], []).append((column, _find(place, "signals", name, messages)))
+    wanted = grouped(
+        (name.split(".")[0], (column, _find(place, "signals", name, messages)))
+        for column, name in enumerate(source.signals)
+    )
     counters: dict[str, Signal] = {}
     for name in source.counters:
         message_name, signal = name.split(".")[0], _find(place, "counters", name, messages)

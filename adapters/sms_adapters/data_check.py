@@ -16,6 +16,7 @@ from sms_online.description.channels import channel_unit, drive_channels, sensed
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
 from sms_online.errors import InputError
+from sms_online.grouping import grouped
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.sample_faults import PIECE, StuckGuard, unit_of_stamps
@@ -115,9 +116,7 @@ class Check(Tabled):
 
 def joined(remarks: Iterable[Remark]) -> list[tuple[bool, str]]:
     """Each remark as a line, with whether it is grave; grave ones first."""
-    channels: dict[tuple[bool, str], list[str]] = {}
-    for remark in remarks:
-        channels.setdefault((remark.grave, remark.text), []).append(remark.channel)
+    channels = grouped(((remark.grave, remark.text), remark.channel) for remark in remarks)
     found = []
     for (grave, text), names in sorted(channels.items(), key=lambda each: not each[0][0]):
         more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""

@@ -19,6 +19,7 @@ from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import System
 from sms_online.description.sources import BagSource, LogSignal, TableSource
 from sms_online.errors import InputError
+from sms_online.grouping import grouped
 from sms_online.stream import Array, Block
 
 # Messages that are turned into arrays at once.
@@ -113,10 +114,8 @@ class LogReader:
 
     def _of_bag(self, bag: Bag) -> Iterator[list[Samples]]:
         """Numbers in the messages of each lane, some thousand messages at a time."""
-        lanes: dict[str, list[Topic]] = {}
         topics = [Topic(lane) for lane in self._lanes]
-        for name, topic in zip(self._topics, topics, strict=True):
-            lanes.setdefault(name, []).append(topic)
+        lanes = grouped(zip(self._topics, topics, strict=True))
         for number, (name, recorded, message) in enumerate(bag.messages(tuple(lanes)), start=1):
             for topic in lanes[name]:
                 topic.add(recorded, message)

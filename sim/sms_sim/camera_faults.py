@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sms_online.errors import InputError
+from sms_online.grouping import grouped
 from sms_online.stream import Block
 
 GRAMMAR = (
@@ -65,11 +66,8 @@ class CameraFaults:
 
     def __init__(self, faults: Sequence[CameraFault], channels: tuple[str, ...], seed: int) -> None:
         """Raises InputError where no point of the channels is meant."""
-        columns: dict[str, list[int]] = {}
-        for k, channel in enumerate(channels):
-            marker, _, axis = channel.rpartition(".")
-            if axis in AXES:
-                columns.setdefault(marker, []).append(k)
+        points = enumerate(channel.rpartition(".") for channel in channels)
+        columns = grouped((marker, k) for k, (marker, _, axis) in points if axis in AXES)
         self._faults = []
         for fault in faults:
             for pattern in fault.markers:

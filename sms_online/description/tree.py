@@ -8,6 +8,7 @@ from functools import cached_property
 
 from sms_online.description.bodies import Mount
 from sms_online.description.schema import System
+from sms_online.grouping import grouped
 
 BASE = -1
 PARENT = re.compile(r"base|link_(?P<number>[1-9]\d*)")
@@ -45,9 +46,7 @@ class Tree:
     @cached_property
     def outwards(self) -> tuple[int, ...]:
         """All links but those on a closed chain, each after its parent, with all that follow it in one run."""
-        children: dict[int, list[int]] = {}
-        for i, parent in enumerate(self.parents):
-            children.setdefault(parent, []).append(i)
+        children = grouped((parent, i) for i, parent in enumerate(self.parents))
         out: list[int] = []
         waiting = children.get(BASE, [])[::-1]
         while waiting:

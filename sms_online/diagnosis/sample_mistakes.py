@@ -12,6 +12,7 @@ import numpy as np
 from sms_online.description.channels import channel_unit
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
+from sms_online.grouping import grouped
 from sms_online.sample_faults import stuck_samples, wrapped_at
 from sms_online.stream import Array, Mask
 
@@ -96,20 +97,17 @@ def _per_channel(names: Sequence[str], change: Callable[[Array], Array]) -> Call
 
 def _groups(names: Sequence[str]) -> dict[str, list[str]]:
     """Channels that one device gives: a link's markers, the base's position; every encoder is its own."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        owner = name.partition(".")[0] if "." in name else "r_S_*" if name.startswith("r_S_") else name
-        groups.setdefault(f"{owner}.*" if "." in name else owner, []).append(name)
-    return groups
+
+    def device(name: str) -> str:
+        return f"{name.partition('.')[0]}.*" if "." in name else "r_S_*" if name.startswith("r_S_") else name
+
+    return grouped((device(name), name) for name in names)
 
 
 def _signs(positions: Sequence[str]) -> Iterator[MistakeHypothesis]:
     single = {name: [name] for name in positions if not name.startswith("e")}
-    joints: dict[str, list[str]] = {}
-    for name in positions:
-        kind, _, joint = name.rpartition("_")
-        if kind in ("q", "theta_m"):
-            joints.setdefault(f"q_{joint}, theta_m_{joint}", []).append(name)
+    parts = [(*name.rpartition("_"), name) for name in positions]
+    joints = grouped((f"q_{i}, theta_m_{i}", name) for kind, _, i, name in parts if kind in ("q", "theta_m"))
     both = {where: names for where, names in joints.items() if len(names) == 2}
     groups = {where: names for where, names in _groups(positions).items() if len(names) > 1}
     for where, names in {**single, **both, **groups}.items():
@@ -159,16 +157,11 @@ def _swaps(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     for name in channels:
         if name.startswith("q_") and f"theta_m_{name[2:]}" in channels:
             pairs.append(([name], [f"theta_m_{name[2:]}"]))
-    markers: dict[str, list[str]] = {}
-    for name in channels:
-        if ".marker_" in name:
-            markers.setdefault(name.rpartition(".")[0], []).append(name)
+    markers = grouped((name.rpartition(".")[0], name) for name in channels if ".marker_" in name)
     for (a, first), (b, second) in combinations(markers.items(), 2):
         if len(first) == len(second) and a.split(".")[0] == b.split(".")[0]:
             pairs.append((first, second))
-    links: dict[str, list[str]] = {}
-    for name, own in markers.items():
-        links.setdefault(name.partition(".")[0], []).extend(own)
+    links = grouped((marker.partition(".")[0], name) for marker, own in markers.items() for name in own)
     for first, second in combinations(links.values(), 2):
         if len(first) == len(second):
             pairs.append((first, second))

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from sms_online.description.tree import BASE
+from sms_online.grouping import grouped
 from sms_online.model import so3
 from sms_online.model.chain import Bracket, Configuration
 from sms_online.model.flexible import ShapeRate
@@ -62,9 +63,7 @@ class _Recursion:
         self._nothing = (np.empty((2, configuration.size, 3, 2, 0)), 0)
         self._load, self._first = self._nothing
         self._handed: dict[int, tuple[Array, int]] = {}  # by what is mounted on a link, or on BASE
-        self._by_frame: dict[int, list[Load]] = {}
-        for load in loads:
-            self._by_frame.setdefault(load[0].frame, []).append(load)
+        self._by_frame = grouped((load[0].frame, load) for load in loads)
 
     @property
     def _columns(self) -> slice:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sms_online.grouping import sampled_together
 from sms_online.pipeline.noise import NORMAL_MAD
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Indices
@@ -105,15 +106,9 @@ class Outliers(Stage):
         return out
 
     def _sampled_together(self, values: Array) -> list[tuple[Indices, Indices]]:
-        """Columns with samples in the same rows, and these rows."""
-        present = ~np.isnan(values[:, self._columns])
-        if present.all():
-            return [(self._columns, np.arange(len(values)))] if self._columns.size else []
-        members: dict[bytes, list[int]] = {}
-        for k, column in enumerate(np.packbits(present, axis=0).T):
-            members.setdefault(column.tobytes(), []).append(k)
-        found = [(self._columns[own], np.flatnonzero(present[:, own[0]])) for own in members.values()]
-        return [(columns, rows) for columns, rows in found if rows.size]
+        """Sensors' columns with samples in the same rows, and these rows."""
+        groups = sampled_together(values[:, self._columns], ("",) * self._columns.size)
+        return [(self._columns[own], rows) for own, rows in groups if rows.size]
 
     def _judged_up_to(self, time: Array, groups: Sequence[tuple[Indices, Indices]]) -> int:
         """Rows whose samples are followed by as many as it takes, or have waited long enough."""

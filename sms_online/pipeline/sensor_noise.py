@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from sms_online.description.schema import System
+from sms_online.grouping import grouped
 from sms_online.pipeline.clocks import other_clocks, reference_clock
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.noise import correlation, density_gain, noise_std
@@ -131,10 +132,7 @@ class NoiseEstimate(Stage):
 
     def _sampled_together(self, channels: list[int]) -> list[list[int]]:
         """Some channels, those with samples at the same instants together."""
-        out: dict[bytes, list[int]] = {}
-        for k in channels:
-            out.setdefault(self.state.samples[k][0].tobytes(), []).append(k)
-        return list(out.values())
+        return list(grouped((self.state.samples[k][0].tobytes(), k) for k in channels).values())
 
     def noise(self, periods: Array, system: System) -> SensorNoise:
         """Noise from what is stated and, where nothing is, from the samples so far.

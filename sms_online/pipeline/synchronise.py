@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from sms_online.grouping import sampled_together
 from sms_online.pipeline.periods import LONGEST_HOLE, Periods
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block, Indices, Mask
@@ -223,7 +224,8 @@ class Synchroniser(Stage):
         on_grid = np.abs(self.state.time - nearest / self.sample_rate) <= self._tolerance
         row_index = np.where(on_grid, nearest, NOWHERE)
         groups = []
-        for columns, rows in self._sampled_together():
+        periods = (period.tobytes() for period in self._periods.known)
+        for columns, rows in sampled_together(self.state.values, periods):
             group, sure, possible = self._judge(k, columns, rows, row_index[rows], final)
             decided &= sure
             complete &= possible
@@ -244,15 +246,6 @@ class Synchroniser(Stage):
         last = np.floor((self.state.time[[*hole, -1]] + reach) * self.sample_rate).astype(np.int64)
         starts = np.maximum([self.state.next, *first], self.state.next)
         return np.concatenate([np.arange(a, b + 1, dtype=np.int64) for a, b in zip(starts, last, strict=True)])
-
-    def _sampled_together(self) -> Iterable[tuple[Indices, Indices]]:
-        """Columns with samples in the same rows and with the same period, with those rows."""
-        present = ~np.isnan(self.state.values)
-        bits = np.packbits(present, axis=0)
-        members: dict[tuple[bytes, bytes], list[int]] = {}
-        for column in range(len(self.channels)):
-            members.setdefault((bits[:, column].tobytes(), self._periods.known[column].tobytes()), []).append(column)
-        return [(np.array(columns), np.flatnonzero(present[:, columns[0]])) for columns in members.values()]
 
     def _judge(
         self, k: Indices, columns: Indices, rows: Indices, row_index: Indices, final: bool

@@ -11,6 +11,7 @@ import numpy as np
 from sms_online.description.explain import hint, nearest
 from sms_online.description.schema import Drift, TrackerChoice
 from sms_online.errors import InputError
+from sms_online.grouping import grouped
 from sms_online.model.parameters import Parameter
 from sms_online.stream import Array, Mask
 from sms_online.trackers.drift import LearnedTrend
@@ -142,11 +143,9 @@ def _columns(drifts: Sequence[Drift], kind: Drift, nuisances: int) -> Mask:
 
 def _groups(drifts: Sequence[Drift], tracked: Tracked) -> list[tuple[int, ...]]:
     """Columns that are learned: one each, but a body's inertial parameters, which its mass moves together."""
-    groups: dict[str, list[int]] = {}
-    for k, (p, drift) in enumerate(zip(tracked.parameters, drifts, strict=True), start=tracked.nuisances):
-        if drift == "learned":
-            groups.setdefault(p.owner if p.owner in TOGETHER else p.name, []).append(k)
-    return [tuple(columns) for columns in groups.values()]
+    places = enumerate(zip(tracked.parameters, drifts, strict=True), start=tracked.nuisances)
+    learned = ((p.owner if p.owner in TOGETHER else p.name, k) for k, (p, drift) in places if drift == "learned")
+    return [tuple(columns) for columns in grouped(learned).values()]
 
 
 def _forgetting(choice: TrackerChoice, rows_per_second: float) -> Forgetting:

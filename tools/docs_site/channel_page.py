@@ -6,6 +6,7 @@ import re
 
 from sms_online.description.channels import channels
 from sms_online.description.parse import parse_system, shipped_systems, shipped_text
+from sms_online.grouping import grouped
 
 
 def channel_tables() -> str:
@@ -19,9 +20,7 @@ def channel_tables() -> str:
 
 def _folded(names: tuple[str, ...]) -> list[str]:
     """Names that differ in their numbers alone as one: link_1…2.marker_1…2.u_y."""
-    groups: dict[str, list[tuple[str, ...]]] = {}
-    for name in names:
-        groups.setdefault(re.sub(r"\d+", "#", name), []).append(tuple(re.findall(r"\d+", name)))
+    groups = grouped((re.sub(r"\d+", "#", name), re.findall(r"\d+", name)) for name in names)
     out = []
     for text, numbers in groups.items():
         for column in zip(*numbers, strict=True):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sms_online.grouping import grouped
+
 # Look-alikes that people are shown: more are a sign of weak data, and nobody reads them.
 SHOWN = 5
 
@@ -19,10 +21,8 @@ def cells_of(value: Mapping[str, Any]) -> list[str]:
 
 def look_alikes(effect: Mapping[str, Any]) -> str:
     """What these data do not separate an effect from, by kind with its places; empty where nothing."""
-    places: dict[str, list[str]] = {}
-    for key in effect["ambiguous_with"][:SHOWN]:
-        name, _, where = key.partition("@")
-        places.setdefault(name, []).append(where)
+    shown = (key.partition("@") for key in effect["ambiguous_with"][:SHOWN])
+    places = grouped((name, where) for name, _, where in shown)
     more = len(effect["ambiguous_with"]) - SHOWN
     kinds = [f"{name} at {', '.join(where)}" for name, where in places.items()]
     return "; ".join(kinds) + (f" and {more} more" if more > 0 else "")

@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sms_online.diagnosis.search import Search
+from sms_online.grouping import grouped
 from sms_tools.found_effects import cells_of, look_alikes, why
 from sms_tools.html_report.arm_drawing import marked_arm
 from sms_tools.html_report.diagnosis_charts import AFTER, BEFORE, law_charts, residual_charts
@@ -92,10 +93,8 @@ def _arm(document: Document, diagnosis: Search) -> Markup:
 def _candidates(document: Document, diagnosis: Search) -> list[dict[str, Any]]:
     """The best by what each alone explains of the whole residual, and those found; none that explains nothing."""
     numbers = {f"{e['name']}@{e['where']}": n for n, e in enumerate(document["effects"], start=1)}
-    like: dict[str, list[str]] = {}
-    for found, effect in enumerate(document["effects"], start=1):
-        for key in effect["ambiguous_with"]:
-            like.setdefault(key, []).append(str(found))
+    effects = enumerate(document["effects"], start=1)
+    like = grouped((key, str(found)) for found, effect in effects for key in effect["ambiguous_with"])
     rows = []
     for rank, ranked in enumerate(diagnosis.ranking, start=1):
         effect = ranked.candidate.effect

@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
+from sms_online.grouping import grouped
+
 # Places that are drawn; a channel's sensor sits at one of them, and where its name does not say, on the base.
 PLACE = re.compile(r"base|tip|(joint|link)_\d+")
 JOINT_CHANNEL = re.compile(r"(?:q|theta_m|tau|force)_(\d+)")
@@ -21,10 +23,7 @@ def places_of(where: str, channels: Sequence[str]) -> list[str]:
 
 def drawn_marks(marks: Mapping[str, str], channels: Sequence[str]) -> dict[str, str]:
     """A judgement's marks at the places that are drawn."""
-    drawn: dict[str, list[str]] = {}
-    for where, text in marks.items():
-        for place in places_of(where, channels):
-            drawn.setdefault(place, []).append(text)
+    drawn = grouped((place, text) for where, text in marks.items() for place in places_of(where, channels))
     return {place: ", ".join(dict.fromkeys(texts)) for place, texts in drawn.items()}
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import rerun as rr
 
 from sms_online.evaluation import Evaluation, identifiable
+from sms_online.grouping import grouped
 from sms_online.model.parameters import Parameter
 from sms_tools.view import style
 from sms_tools.view.known import BOUNDS
@@ -38,10 +39,7 @@ class TrackerLog:
 
     def curves(self) -> dict[str, list[tuple[str, str]]]:
         """Title and entity of each plot, by kind of the parameter."""
-        out: dict[str, list[tuple[str, str]]] = {}
-        for name, (kind, title) in self._drawn.items():
-            out.setdefault(kind, []).append((title, self._folder(name)))
-        return out
+        return grouped((kind, (title, self._folder(name))) for name, (kind, title) in self._drawn.items())
 
     def describe(self, parameters: Sequence[Parameter]) -> None:
         """Parameters that are estimated, those of before first."""
