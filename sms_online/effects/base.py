@@ -181,21 +181,29 @@ def dahl_rate(rate: Array, z: Array, width: float) -> Array:
 
 
 class Force(ForceEffect):
-    """What most force effects share: no torque, no internal state, coefficients reported as they are."""
+    """What most force effects share: no torque, no internal state, coefficients reported as they are.
+
+    symbols: of the entry's coefficients where these are what is linear, with {} for the number of the joint.
+    """
 
     entry: ClassVar[Entry]
+    symbols: ClassVar[tuple[str, ...]] = ()
     needs_torque = False
     n_states = 0
     needs_masses = False
 
     def __init__(
-        self, site: Site, linear: Mapping[str, tuple[str, str, float]], shapes: Mapping[str, float] | None = None
+        self, site: Site, given: Mapping[str, float], linear: Mapping[str, tuple[str, str, float]] | None = None
     ) -> None:
-        """linear: quantity to symbol, unit and nominal value."""
+        """given: declared coefficients. linear: quantity to symbol, unit and nominal value, unless by `symbols`."""
+        if linear is None:
+            number = site.where.replace("joint_", "")
+            own = zip(self.entry.coefficients.items(), self.symbols, strict=True)
+            linear = {name: (symbol.format(number), unit, given.get(name, 0.0)) for (name, unit), symbol in own}
         self.name, self.where, self.index = self.entry.name, site.where, site.index
         traits = self.entry.traits
         self.smooth, self.reversing, self.dry = traits.course == "smooth", traits.reversing, traits.dry
-        self.shapes: Mapping[str, float] = {} if shapes is None else shapes
+        self.shapes: Mapping[str, float] = {name: given[name] for name in self.entry.shapes if name in given}
         self.relative_to: tuple[str, ...] = ()
         self.parameters = tuple(
             Parameter(f"{self.key}.{quantity}", symbol, site.unit(unit), nominal)

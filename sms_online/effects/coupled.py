@@ -33,21 +33,11 @@ class CoupledFriction(Force):
     entry = Entry(
         "coupled_friction", "force", "joint pair", {"torque": "N m", "damping": "N m s/rad"}, BOTH_APART,
     )  # fmt: skip
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        mark = site.where.replace("joint_", "")
-        self._pair = joints_of(site.where)
-        super().__init__(
-            site,
-            {
-                "torque": (f"c_{mark}", "N m", given.get("torque", 0.0)),
-                "damping": (f"d_{mark}", "N m s/rad", given.get("damping", 0.0)),
-            },
-        )
+    symbols = ("c_{}", "d_{}")
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """The same on the rows of both motors."""
-        motors = [layout.theta_m[i] for i in self._pair]
+        motors = [layout.theta_m[i] for i in joints_of(self.where)]
         rate = v[:, motors].sum(axis=1)
         f = np.zeros((*v.shape, 2))
         f[:, motors] = -np.stack((sign(rate), rate), axis=1)[:, None]
@@ -89,7 +79,7 @@ class GravitySpring(Force):
     )  # fmt: skip
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, nominal_parts("g", site.index, "N m", given))
+        super().__init__(site, given, nominal_parts("g", site.index, "N m", given))
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-cos and -sin of q."""

@@ -42,7 +42,7 @@ class Cogging(MotorSide):
     symbol, unit = "g", "N m"
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, nominal_parts(self.symbol, site.index, self.unit, given), {"order": given["order"]})
+        super().__init__(site, given, nominal_parts(self.symbol, site.index, self.unit, given))
         self.gear_ratio = site.gear_ratio
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
@@ -93,8 +93,10 @@ class TorqueOffset(MotorSide):
         ),
     )  # fmt: skip
 
+    symbols = ("o_{}",)
+
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"torque": (f"o_{site.index}", "N m", given.get("torque", 0.0))})
+        super().__init__(site, given)
         self.gear_ratio = site.gear_ratio
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
@@ -121,10 +123,8 @@ class TorqueGain(MotorSide):
         ),
         relative_to="joint_1", said=_gain_in_words,
     )  # fmt: skip
+    symbols = ("g_{}",)
     needs_torque = True
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"ratio": (f"g_{site.index}", "", given.get("ratio", 0.0))})
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """n τ."""

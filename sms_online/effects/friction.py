@@ -56,8 +56,7 @@ class ViscousFriction(MotorSide):
         traits=Traits(curve=Curve("motor speed"), begins=True),
     )  # fmt: skip
 
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"damping": (f"d_{site.index}", "N m s/rad", given.get("damping", 0.0))})
+    symbols = ("d_{}",)
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Minus the rate of the axis."""
@@ -75,8 +74,7 @@ class CoulombFriction(MotorSide):
         traits=Traits(course="dry", curve=Curve("motor speed"), begins=True),
     )  # fmt: skip
 
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"torque": (f"c_{site.index}", "N m", given.get("torque", 0.0))})
+    symbols = ("c_{}",)
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """Minus the sign of the rate of the axis."""
@@ -100,9 +98,7 @@ class StribeckFriction(MotorSide):
         traits=Traits(course="dry", curve=Curve("motor speed")),
     )  # fmt: skip
 
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        linear = {"torque": (f"c_s{site.index}", "N m", given.get("torque", 0.0))}
-        super().__init__(site, linear, {"velocity": given["velocity"]})
+    symbols = ("c_s{}",)
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-sign(θ̇_m) exp(-(θ̇_m / v_s)²)."""
@@ -110,11 +106,26 @@ class StribeckFriction(MotorSide):
         return -(sign(rate) * np.exp(-((rate / self.shapes["velocity"]) ** 2)))[:, None]
 
 
+class DahlFriction(MotorSide):
+    """f = -c z / w with ż = r - |r| z / w of a rate r, w the shape constant `width`. The state z starts at 0."""
+
+    n_states = 1
+
+    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """-z / w."""
+        assert inputs is not None
+        return -inputs.states / self.shapes["width"]
+
+    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
+        """r - |r| z / w."""
+        return dahl_rate(self.rate(layout, v), z, self.shapes["width"])
+
+
 def _presliding_widths(ranges: Ranges) -> tuple[float, ...]:
     return tuple(share * ranges.swing for share in (0.0003, 0.001, 0.003, 0.01, 0.03))
 
 
-class PreslidingFriction(MotorSide):
+class PreslidingFriction(DahlFriction):
     """f = -c z / w with ż = θ̇_m - |θ̇_m| z / w: friction that builds up over a way, and remembers where it comes from.
 
     c: `torque` once the axis slides, N m. w: shape constant `width`, the way over which it builds up, rad at the output
@@ -127,20 +138,7 @@ class PreslidingFriction(MotorSide):
         "slow reversals with small and large motion between them",
         {"width": Shape("rad", 0.001, _presliding_widths)},
     )  # fmt: skip
-    n_states = 1
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        linear = {"torque": (f"c_p{site.index}", "N m", given.get("torque", 0.0))}
-        super().__init__(site, linear, {"width": given["width"]})
-
-    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-z / w."""
-        assert inputs is not None
-        return -inputs.states / self.shapes["width"]
-
-    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
-        """θ̇_m - |θ̇_m| z / w."""
-        return dahl_rate(self.rate(layout, v), z, self.shapes["width"])
+    symbols = ("c_p{}",)
 
 
 class LoadFriction(MotorSide):
@@ -156,14 +154,16 @@ class LoadFriction(MotorSide):
         # Gears lose up to a third of their load; one that loses more than half is locked by it.
         traits=Traits(course="dry", limits={"ratio": (0.0, 0.5)}),
     )  # fmt: skip
+    symbols = ("c_l{}",)
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         ratio, joint = given.get("ratio", 0.0), site.system.joints[site.index - 1]
         if has_motor_side(joint):
-            super().__init__(site, {"friction_stiffness": (f"c k_{site.index}", "N m/rad", ratio * joint.stiffness)})
+            linear = {"friction_stiffness": (f"c k_{site.index}", "N m/rad", ratio * joint.stiffness)}
+            super().__init__(site, given, linear)
             self.relative_to = (f"joint_{site.index}.stiffness",)
         else:
-            super().__init__(site, {"ratio": (f"c_l{site.index}", "", ratio)})
+            super().__init__(site, given)
             self.needs_torque = True
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
@@ -194,10 +194,7 @@ class DirectionFriction(MotorSide):
         traits=Traits(signed=True, course="reversing", curve=Curve("motor speed"), extends=ViscousFriction.entry.name),
     )  # fmt: skip
 
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        i = site.index
-        sides = (("plus", "+"), ("minus", "-"))
-        super().__init__(site, {side: (f"d_{mark}{i}", "N m s/rad", given.get(side, 0.0)) for side, mark in sides})
+    symbols = ("d_+{}", "d_-{}")
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-θ̇_m forwards and backwards."""
@@ -224,8 +221,7 @@ class BearingViscousFriction(LinkSide, ViscousFriction):
         "fast and slow motion with the load that the spring carries at both",
     )  # fmt: skip
 
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        MotorSide.__init__(self, site, {"damping": (f"d_b{site.index}", "N m s/rad", given.get("damping", 0.0))})
+    symbols = ("d_b{}",)
 
 
 class BearingCoulombFriction(LinkSide, CoulombFriction):
@@ -241,5 +237,4 @@ class BearingCoulombFriction(LinkSide, CoulombFriction):
         traits=Traits(course="dry"),
     )  # fmt: skip
 
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        MotorSide.__init__(self, site, {"torque": (f"c_b{site.index}", "N m", given.get("torque", 0.0))})
+    symbols = ("c_b{}",)

@@ -90,7 +90,7 @@ class LearnedForce(Force):
         self.unit = "N" if site.prismatic else "N m"
         count = self._modes.shape[1]
         linear = {f"mode_{k}": (f"l_{site.index},{k}", "N m", 0.0) for k in range(1, count + 1)}
-        super().__init__(site, linear)
+        super().__init__(site, given, linear)
         traits = TRAITS[self.over]
         self.reversing, self.dry = traits.reversing, traits.dry
 

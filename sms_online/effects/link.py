@@ -19,8 +19,10 @@ SEPARATED_BY = "vibration in two modes: damping by stiffness grows with frequenc
 class LinkForce(Force):
     """A generalized force on the elastic coordinates of one link."""
 
-    def __init__(self, site: Site, linear: Mapping[str, tuple[str, str, float]]) -> None:
-        super().__init__(site, linear)
+    def __init__(
+        self, site: Site, given: Mapping[str, float], linear: Mapping[str, tuple[str, str, float]] | None = None
+    ) -> None:
+        super().__init__(site, given, linear)
         kinematics = site.chain.flexible[site.index - 1]
         assert kinematics is not None
         self.kinematics: LinkKinematics = kinematics
@@ -50,7 +52,7 @@ class LinkDamping(LinkForce):
             )
             for p in rigidities
         }  # fmt: skip
-        super().__init__(site, linear)
+        super().__init__(site, given, linear)
         self.relative_to = tuple(p.name for p in rigidities)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
@@ -83,7 +85,7 @@ class LinkMassDamping(LinkForce):
         link = site.system.links[site.index - 1]
         assert link.kind == "flexible"
         nominal = given.get("rate", 0.0) * link.mass_per_length
-        super().__init__(site, {"drag_per_length": (f"c ρA_{site.index}", "N s/m²", nominal)})
+        super().__init__(site, given, {"drag_per_length": (f"c ρA_{site.index}", "N s/m²", nominal)})
         self.relative_to = (f"link_{site.index}.mass_per_length",)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:

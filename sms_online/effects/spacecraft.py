@@ -43,7 +43,8 @@ class ReactionWheel(Force):
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         planar = site.chain.layout.planar
         names = ["torque"] if planar else [f"torque_{axis}" for axis in AXES]
-        super().__init__(site, {name: (name.replace("torque", "T_w"), "N m", given.get(name, 0.0)) for name in names})
+        linear = {name: (name.replace("torque", "T_w"), "N m", given.get(name, 0.0)) for name in names}
+        super().__init__(site, given, linear)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """T_0 e on ω_0; about z in the plane."""
@@ -68,7 +69,8 @@ class ThrusterLeak(Force):
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         names = [f"force_{axis}" for axis in _axes(site)]
-        super().__init__(site, {name: (name.replace("force", "F_l"), "N", given.get(name, 0.0)) for name in names})
+        linear = {name: (name.replace("force", "F_l"), "N", given.get(name, 0.0)) for name in names}
+        super().__init__(site, given, linear)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """T_0 e on ṙ_S."""
@@ -91,11 +93,11 @@ class TableTilt(Constant, Force):
         "a base that turns by a quarter turn or more: gravity does not turn with it, a leak does",
         traits=Traits(signed=True, course="smooth", calibrates=("gravity",)),
     )  # fmt: skip
+    symbols = ("g_x", "g_y")
     needs_masses = True
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        names = ("gravity_x", "gravity_y")
-        super().__init__(site, {name: (name.replace("gravity", "g"), "m/s²", given.get(name, 0.0)) for name in names})
+        super().__init__(site, given)
         self._weight = site.weight
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
@@ -117,9 +119,7 @@ class AirDrag(Force):
     """
 
     entry = Entry("air_drag", "force", "base", {"damping": "N s/m"}, "travel of the base at two speeds, and back")
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"damping": ("d_0", "N s/m", given.get("damping", 0.0))})
+    symbols = ("d_0",)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-ṙ_S."""
@@ -136,9 +136,7 @@ class RotationalDrag(Force):
     """
 
     entry = Entry("rotational_drag", "force", "base", {"damping": "N m s/rad"}, "turns of the base at two rates")
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"damping": ("d_0r", "N m s/rad", given.get("damping", 0.0))})
+    symbols = ("d_0r",)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-ω_0."""
@@ -163,10 +161,7 @@ class CableSpring(Force):
         "cable_spring", "force", "base", {"stiffness": "N/m"}, "travel of the base to both sides, held there",
         {f"rest_{axis}": Shape("m", 0.0, _nowhere_else) for axis in AXES},
     )  # fmt: skip
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        shapes = {name: given[name] for name in (f"rest_{axis}" for axis in _axes(site))}
-        super().__init__(site, {"stiffness": ("c_0", "N/m", given.get("stiffness", 0.0))}, shapes)
+    symbols = ("c_0",)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-(r_S - r_0)."""
@@ -211,7 +206,8 @@ class Slosh(Force):
         mass, stiffness = given.get("mass", 0.0), given.get("stiffness", 0.0)
         omega = float(np.sqrt(stiffness / mass)) if mass > 0.0 and stiffness > 0.0 else given["frequency"]
         nominal = stiffness if "stiffness" in given else mass * omega**2
-        super().__init__(site, {"stiffness": ("c_s", "N/m", nominal)}, {"frequency": omega})
+        super().__init__(site, given, {"stiffness": ("c_s", "N/m", nominal)})
+        self.shapes = {"frequency": omega}
         self.n_states = 2 * len(site.chain.layout.base_linear)
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:

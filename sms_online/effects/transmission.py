@@ -10,7 +10,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Force, Ranges, Shape, Site, dahl_rate, deflection, position
+from sms_online.effects.base import Entry, Ranges, Shape, Site, deflection, position
+from sms_online.effects.friction import DahlFriction, MotorSide
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
@@ -21,26 +22,25 @@ from sms_online.stream import Array
 LARGEST_ERROR = 0.1
 
 
-class Transmission(Force):
+class Transmission(MotorSide):
     """A generalized force pair along δ: what `along` gives acts on θ_m, and its opposite on q."""
-
-    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """Force (B, coefficients) on θ_m of one unit of each coefficient."""
-        raise NotImplementedError
 
     def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """`along` on the row of θ_m, its opposite on that of q."""
-        f = np.zeros((*v.shape, len(self.parameters)))
-        f[:, layout.theta_m[self.index - 1]] = self.along(layout, x, v, inputs)
-        f[:, layout.q[self.index - 1]] = -f[:, layout.theta_m[self.index - 1]]
+        f = super().force(layout, x, v, inputs)
+        f[:, layout.q[self.index - 1]] = -f[:, self.axis(layout)]
         return f
+
+    def rate(self, layout: Layout, v: Array) -> Array:
+        """δ̇ (B,)."""
+        return v[:, layout.theta_m[self.index - 1]] - v[:, layout.q[self.index - 1]]
 
 
 def _widths(ranges: Ranges) -> tuple[float, ...]:
     return tuple(share * ranges.deflection for share in (0.01, 0.03, 0.1, 0.3))
 
 
-class TorsionalHysteresis(Transmission):
+class TorsionalHysteresis(Transmission, DahlFriction):
     """f = -c z / δ_s along δ with ż = δ̇ - |δ̇| z / δ_s: the spring's torque depends on where it comes from.
 
     c: `torque` that it saturates at, N m. δ_s: shape constant `width`, rad. The internal state z starts at 0.
@@ -52,21 +52,7 @@ class TorsionalHysteresis(Transmission):
         "slow load cycles of two amplitudes: damping fades with speed, hysteresis does not",
         {"width": Shape("rad", 0.01, _widths)},
     )  # fmt: skip
-    n_states = 1
-
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        linear = {"torque": (f"h_{site.index}", "N m", given.get("torque", 0.0))}
-        super().__init__(site, linear, {"width": given["width"]})
-
-    def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-z / δ_s."""
-        assert inputs is not None
-        return -inputs.states / self.shapes["width"]
-
-    def state_rate(self, layout: Layout, x: Array, v: Array, z: Array) -> Array:
-        """δ̇ - |δ̇| z / δ_s."""
-        rate = v[:, layout.theta_m[self.index - 1]] - v[:, layout.q[self.index - 1]]
-        return dahl_rate(rate, z, self.shapes["width"])
+    symbols = ("h_{}",)
 
 
 class CubicStiffness(Transmission):
@@ -80,8 +66,7 @@ class CubicStiffness(Transmission):
         traits=Traits(signed=True, curve=Curve("deflection", between=True)),
     )  # fmt: skip
 
-    def __init__(self, site: Site, given: Mapping[str, float]) -> None:
-        super().__init__(site, {"stiffness": (f"k_3{site.index}", "N m/rad³", given.get("stiffness", 0.0))})
+    symbols = ("k_3{}",)
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-δ³."""
@@ -104,7 +89,7 @@ class Backlash(Transmission):
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         nominal = given.get("stiffness", site.system.joints[site.index - 1].stiffness)
-        super().__init__(site, {"stiffness": (f"k_g{site.index}", "N m/rad", nominal)}, {"gap": given["gap"]})
+        super().__init__(site, given, {"stiffness": (f"k_g{site.index}", "N m/rad", nominal)})
         if "stiffness" not in given:
             self.relative_to = (f"joint_{site.index}.stiffness",)
 
@@ -142,7 +127,7 @@ class KinematicError(Transmission):
 
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         linear = nominal_parts("e", site.index, "N m", given, site.system.joints[site.index - 1].stiffness)
-        super().__init__(site, linear, {"order": given["order"]})
+        super().__init__(site, given, linear)
         self.gear_ratio = site.gear_ratio
         self.relative_to = (f"joint_{site.index}.stiffness",)
 
