@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.calibration.channels import Motion, low_pass_families, position_families, torque_families
+from sms_online.calibration.channels import Families, Motion
 from sms_online.calibration.columns import CalibrationColumns, nuisances
 from sms_online.calibration.geometry import Geometry, geometries
 from sms_online.description.schema import System, Tolerances
@@ -104,17 +104,17 @@ class Rows:
         torque = sensing.joint_torque(self.exact)
         motion = Motion(readings, rates, torque, model.layout.base_pose(x)[1])
         gear = sensing.joint_torque(np.ones_like(self.exact[:1]))[0]
-        out = []
-        for family in position_families(sensing, model.system.tolerances):
+        out, families = [], Families.of(sensing)
+        for family in families.positions:
             for column in np.moveaxis(family.adds(motion), 2, 0):
                 out.append(np.zeros_like(self.exact))
                 out[-1][:, sensing.position_columns] = column
-        for low_pass in low_pass_families(sensing, model.system.tolerances):
+        for low_pass in families.low_passes:
             slopes = np.gradient(low_pass.adds(motion), 1.0 / model.system.sample_rate, axis=0)
             for column in np.moveaxis(slopes, 2, 0):
                 out.append(np.zeros_like(self.exact))
                 out[-1][:, sensing.position_columns] = column
-        for torques in torque_families(sensing, model.system.tolerances):
+        for torques in families.torques:
             for column in np.moveaxis(torques.adds(motion), 2, 0):
                 out.append(np.zeros_like(self.exact))
                 out[-1][:, sensing.torque_columns] = column / gear

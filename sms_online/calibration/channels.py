@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from sms_online.calibration.geometry import axis_tolerance, on_base, own_axis
+from sms_online.calibration.multiplied_noise import Multiplied
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.channels import AXES
 from sms_online.description.schema import Tolerances
@@ -36,43 +37,75 @@ class Motion:
 
 @dataclass(frozen=True)
 class Family:
-    """Nuisances of one kind; adds: motion to what one unit of each adds to readings, (K, sensors, c).
+    """Nuisances of one kind: of position sensors, whose readings are (K, sensors), or of torques n τ, (K, joints).
 
-    multiplies: sensors that each nuisance adds a multiple of their own readings to, none by default.
+    adds: motion to what one unit of each adds to these, (K, ·, c). multiplies: what each adds a multiple of its own
+    readings to, none by default.
     """
 
     nuisances: tuple[Nuisance, ...]
     adds: Callable[[Motion], Array]
-    multiplies: tuple[tuple[int, ...], ...] = ()
+    multiplies: tuple[Multiplied, ...] = ()
+
+    @property
+    def tolerated(self) -> bool:
+        """Whether it has nuisances, which may differ from zero."""
+        return bool(self.nuisances) and all(each.tolerance > 0.0 for each in self.nuisances)
 
 
 @dataclass(frozen=True)
-class TorqueFamily:
-    """Nuisances of torques; adds: motion to what one unit of each adds to n τ, (K, joints, c); multiplies: joints."""
+class Families:
+    """Nuisances of a session's channels, in this order. positions: of the position sensors. torques: of the torques.
 
-    nuisances: tuple[Nuisance, ...]
-    adds: Callable[[Motion], Array]
-    multiplies: tuple[tuple[int, ...], ...] = ()
-
-
-def position_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
-    """Families of the position sensors' nuisances that have a tolerance."""
-    names = [sensing.channels[column] for column in sensing.position_columns]
-    every = [
-        *_clocks(sensing, names, tolerances.clock),
-        *_encoders(sensing, names, tolerances),
-        *_markers(names, tolerances),
-        *_camera(sensing, names, tolerances),
-    ]
-    return [family for family in every if family.nuisances and all(each.tolerance > 0.0 for each in family.nuisances)]
-
-
-def low_pass_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
-    """Families whose rate is what one unit of each adds to the position sensors' readings.
-
-    A low-pass of second order reads y of x = y + c ẏ + ÿ / ω²: beside the clock, which is late by c, it has ω.
+    low_passes: those whose rate is what one unit of each adds to the position sensors' readings.
     """
-    names = [sensing.channels[column] for column in sensing.position_columns]
+
+    positions: tuple[Family, ...]
+    low_passes: tuple[Family, ...]
+    torques: tuple[Family, ...]
+
+    @classmethod
+    def of(cls, sensing: Sensing) -> Families:
+        """Those that have a tolerance."""
+        tolerances = sensing.model.system.tolerances
+        names = [sensing.channels[column] for column in sensing.position_columns]
+        positions = (
+            *_clocks(sensing, names, tolerances.clock),
+            *_encoders(sensing, names, tolerances),
+            *_markers(names, tolerances),
+            *_camera(sensing, names, tolerances),
+        )
+        every = (positions, _low_passes(names, tolerances), _torques(sensing, tolerances))
+        return cls(*(tuple(family for family in families if family.tolerated) for families in every))
+
+    @property
+    def nuisances(self) -> tuple[Nuisance, ...]:
+        """Of all."""
+        return nuisances_of((*self.positions, *self.low_passes, *self.torques))
+
+    @property
+    def multiplied(self) -> tuple[Multiplied, ...]:
+        """What nuisances multiply, by their number."""
+        out, first = [], 0
+        for family in (*self.positions, *self.low_passes, *self.torques):
+            out += [replace(each, column=first + k) for k, each in enumerate(family.multiplies)]
+            first += len(family.nuisances)
+        return tuple(out)
+
+
+def nuisances_of(families: Iterable[Family]) -> tuple[Nuisance, ...]:
+    """Nuisances of some families, in their order."""
+    return tuple(each for family in families for each in family.nuisances)
+
+
+def added(families: Iterable[Family], motion: Motion, width: int) -> Array:
+    """What one unit of each nuisance adds to so many readings or torques, (K, width, ·)."""
+    none = np.empty((len(motion.readings), width, 0))
+    return np.concatenate((none, *(family.adds(motion) for family in families)), axis=2)
+
+
+def _low_passes(names: Sequence[str], tolerances: Tolerances) -> list[Family]:
+    """A low-pass of second order reads y of x = y + c ẏ + ÿ / ω²: beside the clock, which is late by c, it has ω."""
     gauges = [k for k, name in enumerate(names) if name.endswith("strain_angle")]
     if not gauges or not tolerances.gauge_low_pass:
         return []
@@ -81,8 +114,8 @@ def low_pass_families(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
     return [Family((low_pass,), lambda motion: -(motion.rates * read)[:, :, None])]
 
 
-def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFamily]:
-    """Families of the torques' nuisances that have a tolerance, but for what the system file declares as effects."""
+def _torques(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
+    """Not what the system file declares as effects."""
     effects = sensing.model.system.effects
     declared = {(name, e.where) for e in effects for name in ENTRIES[e.name].traits.calibrates}
     joints = [i for i, joint in enumerate(sensing.model.system.joints) if not joint.passive]
@@ -93,18 +126,17 @@ def torque_families(sensing: Sensing, tolerances: Tolerances) -> list[TorqueFami
     part = "against joint_1" if first else ""
     gained = [i for i in joints if i >= first and ("drive_gain", f"joint_{i + 1}") not in declared]
     shifted = [i for i in joints if ("drive_offset", f"joint_{i + 1}") not in declared]
-    every = [
-        TorqueFamily(
+    return [
+        Family(
             tuple(Nuisance("drive_gain", f"joint_{i + 1}", "", tolerances.drive_gain, part) for i in gained),
             partial(_of_torque, gained),
-            tuple((i,) for i in gained),
+            tuple(Multiplied(None, joints=(i,)) for i in gained),
         ),
-        TorqueFamily(
+        Family(
             tuple(Nuisance("drive_offset", f"joint_{i + 1}", units[i], offset) for i in shifted),
             partial(_one_torque, shifted),
         ),
     ]
-    return [family for family in every if family.nuisances and all(each.tolerance > 0.0 for each in family.nuisances)]
 
 
 def _of_torque(joints: Sequence[int], motion: Motion) -> Array:
@@ -182,7 +214,7 @@ def _camera(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) -> I
             Nuisance("camera_scale", "base and markers" if layout.free else "markers", "", tolerances.camera_scale),
         )
         seen = np.isin(np.arange(len(names)), metres)
-        yield Family(scale, lambda motion: (motion.readings * seen)[:, :, None], (tuple(metres),))
+        yield Family(scale, lambda motion: (motion.readings * seen)[:, :, None], (Multiplied(None, tuple(metres)),))
     spacecraft = sensing.model.system.spacecraft
     if spacecraft is None:
         return

@@ -8,22 +8,11 @@ is read too large by n(t) adds ∫ φ n dt to b, so N. With the right geometry m
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import chain
-
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from sms_online.calibration.channels import (
-    Family,
-    Motion,
-    TorqueFamily,
-    low_pass_families,
-    position_families,
-    torque_families,
-)
+from sms_online.calibration.channels import Families, Motion, added, nuisances_of
 from sms_online.calibration.geometry import geometries
-from sms_online.calibration.multiplied_noise import Multiplied
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.calibration.truncation import Truncation, truncations
 from sms_online.model.model import Model
@@ -42,21 +31,8 @@ DEGREE = 7
 def nuisances(sensing: Sensing) -> tuple[Nuisance, ...]:
     """What a session's description may be wrong in, in the order of its columns."""
     system = sensing.model.system
-    positions = [each.nuisances for each in position_families(sensing, system.tolerances)]
-    low_passes = [each.nuisances for each in low_pass_families(sensing, system.tolerances)]
-    torques = [each.nuisances for each in torque_families(sensing, system.tolerances)]
-    channels = chain.from_iterable((*positions, *low_passes, *torques))
-    return (*channels, *(each.nuisance for each in geometries(system)), *truncations(system))
-
-
-def _multiplied(families: Sequence[Family | TorqueFamily]) -> Iterator[Multiplied]:
-    """What nuisances multiply, of families in the order of their columns."""
-    first = 0
-    for family in families:
-        for k, chosen in enumerate(family.multiplies):
-            of_torques = isinstance(family, TorqueFamily)
-            yield Multiplied(first + k, () if of_torques else chosen, chosen if of_torques else ())
-        first += len(family.nuisances)
+    of_geometry = (each.nuisance for each in geometries(system))
+    return (*Families.of(sensing).nuisances, *of_geometry, *truncations(system))
 
 
 def _interpolation(at: Indices, derivative: int = 0) -> Array:
@@ -66,20 +42,16 @@ def _interpolation(at: Indices, derivative: int = 0) -> Array:
 
 
 class CalibrationState(State):
-    """What nuisances change at a segment's instants.
+    """What nuisances change at a segment's instants, from number `first` on, each by nuisance.
 
-    From instant number `first` on: what a position sensor reads too much, added (K, sensors, ·), and what has that for
-    its rate, before (K, sensors, ·); what a torque reads too much, torque (K, joints, ·); and by what another geometry
-    changes momentum and force (K, n_v, ·), and more elements both (K, 2, n_v, ·), each by nuisance.
+    read: what a position sensor reads too much (K, sensors, ·), what has that for its rate (K, sensors, ·), and what a
+    torque reads too much (K, joints, ·). moved: by what another geometry changes momentum and force (K, 2, n_v, ·), and
+    by what more elements do.
     """
 
     first: int
-    added: Array
-    before: Array
-    torque: Array
-    momentum: Array
-    force: Array
-    truncation: Array
+    read: list[Array]
+    moved: list[Array]
 
 
 class CalibrationColumns(Stage):
@@ -92,10 +64,13 @@ class CalibrationColumns(Stage):
     def __init__(self, model: Model, sensing: Sensing, span: float) -> None:
         self.count = len(nuisances(sensing))
         self._model, self._sensing = model, sensing
-        self._positions = position_families(sensing, sensing.model.system.tolerances)
-        self._low_passes = low_pass_families(sensing, sensing.model.system.tolerances)
-        self._torques = torque_families(sensing, sensing.model.system.tolerances)
-        self.multiplied = tuple(_multiplied([*self._positions, *self._low_passes, *self._torques]))
+        families = Families.of(sensing)
+        self.multiplied = families.multiplied
+        sensors = len(sensing.position_columns)
+        # Families with the number of readings that they add to.
+        self._read = (
+            (families.positions, sensors), (families.low_passes, sensors), (families.torques, len(model.layout.q))
+        )  # fmt: skip
         # Of the session's system: an event's may hold more that has a geometry.
         self.geometries = tuple(geometries(sensing.model.system))
         self._truncation = Truncation(model, span / INSTANTS)
@@ -112,20 +87,12 @@ class CalibrationColumns(Stage):
 
     def forget(self, next_instant: int) -> None:
         """Begin anew: `next_instant` is the number of the first one to come."""
-        layout = self._model.layout
-        sensors = len(self._sensing.position_columns)
-        families = (self._positions, self._low_passes, self._torques)
-        widths = [sum(len(each.nuisances) for each in family) for family in families]
-        moved = self.count - sum(widths) - self._truncation.count
         self._truncation.begin_segment()
+        moved = (len(self.geometries), self._truncation.count)
         self.state = CalibrationState(
             next_instant,
-            np.empty((0, sensors, widths[0])),
-            np.empty((0, sensors, widths[1])),
-            np.empty((0, len(layout.q), widths[2])),
-            np.empty((0, layout.n_v, moved)),
-            np.empty((0, layout.n_v, moved)),
-            np.empty((0, 2, layout.n_v, self._truncation.count)),
+            [np.empty((0, width, len(nuisances_of(families)))) for families, width in self._read],
+            [np.empty((0, 2, self._model.layout.n_v, count)) for count in moved],
         )
 
     def extend(self, pi: Array, x: Array, v: Array, signals: Array, rates: Array, by_geometry: Array) -> None:
@@ -138,21 +105,16 @@ class CalibrationColumns(Stage):
         torque = signals[:, : len(self._model.layout.q)]
         _, T_0 = self._model.layout.base_pose(x)
         motion = Motion(self._sensing.readings(x), rates, torque, T_0)
-        momentum, force = by_geometry
         now = self.state
-        again, truncation = self._truncation.extend(pi, x, v, signals)
-        now.truncation = np.concatenate((now.truncation[: len(now.truncation) - again], truncation))
-        now.added = np.concatenate((now.added, self._sum_of(self._positions, motion, now.added)))
-        now.before = np.concatenate((now.before, self._sum_of(self._low_passes, motion, now.before)))
-        now.torque = np.concatenate((now.torque, self._sum_of(self._torques, motion, now.torque)))
-        now.momentum = np.concatenate((now.momentum, momentum))
-        now.force = np.concatenate((now.force, force))
-
-    @staticmethod
-    def _sum_of(families: Sequence[Family] | Sequence[TorqueFamily], motion: Motion, like: Array) -> Array:
-        """What families add, side by side (K, sensors or joints, ·), as in an array of before."""
-        none = np.empty((len(motion.readings), like.shape[1], 0))
-        return np.concatenate((none, *(family.adds(motion) for family in families)), axis=2)
+        again, by_truncation = self._truncation.extend(pi, x, v, signals)
+        fresh = [added(families, motion, width) for families, width in self._read]
+        now.read = [np.concatenate(pair) for pair in zip(now.read, fresh, strict=True)]
+        geometry, truncation = now.moved
+        truncation = truncation[: len(truncation) - again]
+        now.moved = [
+            np.concatenate((geometry, by_geometry.swapaxes(0, 1))),
+            np.concatenate((truncation, by_truncation)),
+        ]
 
     def _kernel(self, offset: int, span: float) -> Array:
         """Weights (STEPS + 1, ·) of H, ∂Pπ/∂x, ∂Gπ/∂v and ∂Gπ/∂x in the integral of c times what is added.
@@ -177,10 +139,11 @@ class CalibrationColumns(Stage):
         now, inside = self.state, (starts - self.state.first)[:, None] + np.arange(INSTANTS + 1)
         parts = np.concatenate((sensitivity.H, sensitivity.P_x, sensitivity.G_v, sensitivity.G_x), axis=1)
         parts, rough = parts.reshape(W, -1, n_v * sensors), rough.reshape(W, STEPS + 1, -1)
-        positions = []
+        out = []
+        position, position_rate, torque = now.read
         for kernels, to_steps, read in (
-            (self._kernels, self._to_steps, now.added),
-            (self._rate_kernels, self._rate_to_steps, now.before),
+            (self._kernels, self._to_steps, position),
+            (self._rate_kernels, self._rate_to_steps, position_rate),
         ):
             if not read.shape[2]:
                 continue
@@ -188,13 +151,12 @@ class CalibrationColumns(Stage):
             if rough.any():
                 weights += to_steps.T @ rough
             flat = weights.reshape(W, -1, n_v, sensors).swapaxes(1, 2).reshape(W, n_v, -1)
-            positions.append(-flat @ read[inside].reshape(W, flat.shape[2], -1))
-        torques = np.zeros((W, n_v, now.torque.shape[2]))
-        torques[:, self._joint_rows] = self._over(self._phi, now.torque[inside])
-        moved = -self._over(self._phi_dot, now.momentum[inside]) - self._over(self._phi, now.force[inside])
-        momentum, force = now.truncation[inside].swapaxes(0, 2).swapaxes(1, 2)
-        finer = -self._over(self._phi_dot, momentum) - self._over(self._phi, force)
-        return np.concatenate((*positions, torques, moved, finer), axis=2)
+            out.append(-flat @ read[inside].reshape(W, flat.shape[2], -1))
+        torques = np.zeros((W, n_v, torque.shape[2]))
+        torques[:, self._joint_rows] = self._over(self._phi, torque[inside])
+        changes = [np.moveaxis(each[inside], 2, 0) for each in now.moved]
+        moved = [-self._over(self._phi_dot, momentum) - self._over(self._phi, force) for momentum, force in changes]
+        return np.concatenate((*out, torques, *moved), axis=2)
 
     @staticmethod
     def _over(weights: Array, values: Array) -> Array:
@@ -205,8 +167,6 @@ class CalibrationColumns(Stage):
         """Forget instants with smaller numbers."""
         if self.count:
             kept = slice(before - self.state.first, None)
-            self.state.added, self.state.before = self.state.added[kept], self.state.before[kept]
-            self.state.torque = self.state.torque[kept]
-            self.state.momentum, self.state.force = self.state.momentum[kept], self.state.force[kept]
-            self.state.truncation = self.state.truncation[kept]
+            self.state.read = [each[kept] for each in self.state.read]
+            self.state.moved = [each[kept] for each in self.state.moved]
         self.state.first = before

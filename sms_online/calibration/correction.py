@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sms_online.calibration.channels import Motion, position_families
+from sms_online.calibration.channels import Families, Motion
 from sms_online.effects.delay import ahead
 from sms_online.pipeline.convolution import Convolution
 from sms_online.pipeline.sensing import Sensing
@@ -20,7 +20,7 @@ class Correction(Convolution):
 
     def __init__(self, sensing: Sensing, sample_rate: float, nuisances: Array) -> None:
         self._sensing, self._nuisances = sensing, nuisances
-        self._families = position_families(sensing, sensing.model.system.tolerances)
+        self._families = Families.of(sensing).positions
         self._columns = sensing.position_columns
         late = self._late()
         kernels = [ahead(seconds, sample_rate) for seconds in late.tolist()]

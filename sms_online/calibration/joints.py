@@ -6,14 +6,10 @@ to the rows of joints is little beside it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from itertools import chain
-
 import numpy as np
 
-from sms_online.calibration.channels import Family, Motion, TorqueFamily, position_families, torque_families
+from sms_online.calibration.channels import Families, Motion, added, nuisances_of
 from sms_online.calibration.columns import nuisances
-from sms_online.calibration.nuisance import Nuisance
 from sms_online.pipeline.sensing import Sensing
 from sms_online.stream import Array
 
@@ -26,9 +22,9 @@ class JointCalibration:
     """
 
     def __init__(self, sensing: Sensing) -> None:
-        layout, tolerances = sensing.model.layout, sensing.model.system.tolerances
-        self._positions, self._torques = position_families(sensing, tolerances), torque_families(sensing, tolerances)
-        self.of_positions, self.of_torques = _nuisances(self._positions), _nuisances(self._torques)
+        layout, self._families = sensing.model.layout, Families.of(sensing)
+        of = (self._families.positions, self._families.torques)
+        self.of_positions, self.of_torques = (nuisances_of(each) for each in of)
         number = {nuisance: k for k, nuisance in enumerate(nuisances(sensing))}
         self.positions, self.torques = ([number[each] for each in own] for own in (self.of_positions, self.of_torques))
         # Any positions serve: rows of joints do not depend on them. Euler parameters of no rotation end with η = 1.
@@ -38,14 +34,8 @@ class JointCalibration:
 
     def deflections(self, motion: Motion) -> Array:
         """By how much deflections are read too large, (K, joints, positions)."""
-        out = np.concatenate([each.adds(motion) for each in self._positions], axis=2) if self._positions else None
-        return np.zeros((len(motion.readings), len(self._deflection), 0)) if out is None else self._deflection @ out
+        return np.asarray(self._deflection @ added(self._families.positions, motion, self._deflection.shape[1]))
 
     def torque(self, motion: Motion) -> Array:
         """By how much torques n τ are read too large, (K, joints, torques)."""
-        out = [each.adds(motion) for each in self._torques]
-        return np.concatenate(out, axis=2) if out else np.zeros((*motion.torque.shape, 0))
-
-
-def _nuisances(families: Iterable[Family | TorqueFamily]) -> tuple[Nuisance, ...]:
-    return tuple(chain.from_iterable(family.nuisances for family in families))
+        return added(self._families.torques, motion, motion.torque.shape[1])

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import msgspec
 import numpy as np
 
-from sms_online.calibration.channels import position_families
+from sms_online.calibration.channels import Families, nuisances_of
 from sms_online.calibration.correction import Correction
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.description.schema import Tolerances
@@ -63,10 +63,9 @@ class Linearisation(Stage):
         self, sensing: Sensing, nuisances: Sequence[Nuisance], sample_rate: float, first: int, learns: bool
     ) -> None:
         self._sensing, self._sample_rate = sensing, sample_rate
-        families = position_families(sensing, sensing.model.system.tolerances)
         clocks = np.array([each.name == "clock" for each in nuisances], dtype=np.bool_)
         self._largest = np.where(clocks, LATEST, np.inf)
-        self._movable = np.arange(len(nuisances)) < sum(len(each.nuisances) for each in families)
+        self._movable = np.arange(len(nuisances)) < len(nuisances_of(Families.of(sensing).positions))
         self._linear = np.array([getattr(LINEAR, each.name) or 0.0 for each in nuisances], dtype=np.float64)
         remembers = bool(self._movable.any()) or learns
         self.state = LinearisationState(np.zeros(len(nuisances)), first, remembers=remembers)
