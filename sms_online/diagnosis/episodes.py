@@ -7,7 +7,32 @@ from typing import Any
 
 from sms_online.diagnosis.searcher import Named, Outcome
 from sms_online.pipeline.events import Event
+from sms_online.trackers.information import Information
 from sms_online.verdict.evidence import Discrepancy
+
+# A search is made when there are so many windows after an effect has begun: 1.2, 2, 3.2, 4.8, 7.2 and 12 s at the usual
+# width; and of one that may have been there all the time, when so many are remembered: 4, 6, 8, 12 and 16 s.
+DUE = (3.0, 5.0, 8.0, 12.0, 18.0, 30.0)
+DUE_FROM_THE_START = (10.0, 15.0, 20.0, 30.0, 40.0)
+
+
+@dataclass(frozen=True)
+class Onset:
+    """When an effect has begun, as grid indices: it is absent up to `last`, and present from `first`.
+
+    last: None where it may always have been there. known: from before. patient: see `MomentumState`; of the rows that
+    show it.
+    """
+
+    last: int | None
+    first: int
+    known: Information
+    patient: bool
+
+    @property
+    def due(self) -> tuple[float, ...]:
+        """Windows after it at which a search is due."""
+        return DUE_FROM_THE_START if self.last is None else DUE
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,17 @@ later block, which has to be the same one in the repetition (`Searcher`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.episodes import Episode, SearchAnswer, discrepancy, episode_document, line
+from sms_online.diagnosis.episodes import Episode, Onset, SearchAnswer, discrepancy, episode_document, line
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import Segment, joined
-from sms_online.diagnosis.searcher import Named, Outcome, Request, Searcher
+from sms_online.diagnosis.searcher import Outcome, Request, Searcher
 from sms_online.effects.build import with_effects
+from sms_online.grouping import grouped
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import ModelUpdate
 from sms_online.pipeline.estimator import Estimator
@@ -29,7 +29,6 @@ from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Mask
-from sms_online.trackers.information import Information
 from sms_online.verdict.evidence import Discrepancy
 
 # Times are in units of the windows of the momentum balance, those of 0.4 s at least.
@@ -38,24 +37,8 @@ SHORTEST_UNIT = 0.4
 REMEMBERED, BEFORE = 40.0, 15.0
 # Fewer before an effect determine nothing beside it: it may as well have been there from the start.
 LEAST_BEFORE = 5.0
-# A search is made when there are so many after an effect has begun: 1.2, 2, 3.2, 4.8, 7.2 and 12 s; and of one that may
-# have been there all the time, when so many are remembered: 4, 6, 8, 12 and 16 s.
-DUE = (3.0, 5.0, 8.0, 12.0, 18.0, 30.0)
-DUE_FROM_THE_START = (10.0, 15.0, 20.0, 30.0, 40.0)
-
 # Episodes whose effects are added to the model at most: what is left of a real rig then is for a person.
 MOST_ADOPTED = 8
-
-
-@dataclass(frozen=True)
-class _Onset:
-    """Grid indices: the effect is absent up to `last`, None where it may always have been there, and present from
-    `first`. known: from before. patient: see `MomentumState`; of the rows that show it."""
-
-    last: int | None
-    first: int
-    known: Information
-    patient: bool
 
 
 class OnlineDiagnosis(Observer):
@@ -78,7 +61,7 @@ class OnlineDiagnosis(Observer):
         self._events = len(estimator.events)
         self._drifts = 0 if estimator.momentum is None else estimator.momentum.bank.accepted  # that have been followed
         self._quiet = False  # what is lacking has been said, and not added to the model
-        self._onset: _Onset | None = None  # of the open episode
+        self._onset: Onset | None = None  # of the open episode
         self._rows: Momentum | None = None  # that were there at the last block
         self._agreed = False  # two searches in a row have named the same in the open episode
         self._sure = False  # and nothing else explains it as well, as far as is known
@@ -93,17 +76,13 @@ class OnlineDiagnosis(Observer):
         system, momentum = self._estimator.system, self._estimator.momentum
         found = [named.effect for episode in self.episodes for named in episode.named]
         # A session that was resumed knows of more than its own episodes.
-        changed = () if momentum is None else momentum.changes.added
-        found += () if momentum is None else momentum.changes.adopted
-        for key in dict.fromkeys(name.rsplit(".", 1)[0] for name in changed if "@" in name):
-            name, _, where = key.partition("@")
-            found.append(Effect(name=name, where=where))
+        if momentum is not None:
+            found += momentum.changes.adopted
+            added = (name.rsplit(".", 1)[0].partition("@") for name in momentum.changes.added if "@" in name)
+            found += [Effect(name=name, where=where) for name, _, where in added]
         held = {effect.key for effect in system.effects}
-        fresh: dict[str, Effect] = {}
-        for effect in found:
-            if effect.key not in held:
-                fresh.setdefault(effect.key, effect)
-        return with_effects(system, fresh.values())
+        fresh = grouped((effect.key, effect) for effect in found if effect.key not in held)
+        return with_effects(system, [first for first, *_ in fresh.values()])
 
     @property
     def notices(self) -> list[str]:
@@ -220,9 +199,9 @@ class OnlineDiagnosis(Observer):
             return
         seen = detector.before(last) if last >= 0 else None
         if seen is None or last - self._valid < LEAST_BEFORE * self._unit:
-            onset = _Onset(None, self._valid, self._momentum.changes.beforehand, patient)
+            onset = Onset(None, self._valid, self._momentum.changes.beforehand, patient)
         else:
-            onset = _Onset(last, first, seen.known, patient)
+            onset = Onset(last, first, seen.known, patient)
         before, self._onset = self._onset, onset
         noticed = self._now
         if before is not None:
@@ -240,9 +219,8 @@ class OnlineDiagnosis(Observer):
         if onset is None or self._sure:
             return
         newest = int(self._record[-1].index[-1])
-        schedule = self._schedule(onset)
         first = max(onset.first, int(self._record[0].index[0]))
-        due = int(np.count_nonzero((newest - first) / self._unit >= np.array(schedule)))
+        due = int(np.count_nonzero((newest - first) / self._unit >= np.array(onset.due)))
         if self._pending is not None:
             return  # what falls due meanwhile is searched right after it, in all that has come by then
         if due > self._due:
@@ -251,12 +229,8 @@ class OnlineDiagnosis(Observer):
             request = self._request(onset)
             if request is not None and self.searcher.submit(self._begun, request):
                 self._pending = self._begun, self._now
-        elif self._due == len(schedule):
+        elif self._due == len(onset.due):
             self._give_up()
-
-    @staticmethod
-    def _schedule(onset: _Onset) -> tuple[float, ...]:
-        return DUE_FROM_THE_START if onset.last is None else DUE
 
     def _give_up(self) -> None:
         """All that is remembered was searched: what was not named twice is not known."""
@@ -270,7 +244,7 @@ class OnlineDiagnosis(Observer):
         self._close()
         self.on_verdict(self._now, line(episode))
 
-    def _request(self, onset: _Onset) -> Request | None:
+    def _request(self, onset: Onset) -> Request | None:
         """The record, cut where the effect began."""
         estimator = self._estimator
         before: list[Segment] = []
@@ -312,7 +286,7 @@ class OnlineDiagnosis(Observer):
         self.on_evidence(evidence.known, outcome.scores)
         if outcome.ended and self._onset is not None:
             # So much is lacking that only all that can be remembered is worth another search.
-            self._due = max(self._due, len(self._schedule(self._onset)) - 1)
+            self._due = max(self._due, len(self._onset.due) - 1)
         if outcome.verdict != "named":
             self._agreed = False
             episode.verdict, episode.named, episode.named_at = "noticed", (), None
@@ -371,7 +345,7 @@ class OnlineDiagnosis(Observer):
         late = newest.index >= first
         samples = GridSamples(newest.index[late], newest.values[late], last)
         time = self._time(int(samples.index[0])) if episode.began is None or not outcome.began else episode.began
-        sizes = {name: size for named in outcome.named for name, size in _sizes(named).items()}
+        sizes = {name: size for named in outcome.named for name, size in named.sizes.items()}
         event = Event(
             time=time,
             kind="effect",
@@ -387,15 +361,6 @@ class OnlineDiagnosis(Observer):
         self._events = len(estimator.events)
         self._valid = since
         episode.adopted = self._now
-
-
-def _sizes(named: Named) -> dict[str, tuple[float, float, str]]:
-    """Value, 1σ and unit of each parameter of an effect, or of each constant where it has none."""
-    if named.parameters:
-        read = zip(named.values.tolist(), named.stds.tolist(), named.units, strict=True)
-        return dict(zip(named.parameters, read, strict=True))
-    said = named.coefficients.items()
-    return {f"{named.key}.{name}": (value, std, unit) for name, (value, std, unit) in said if std is not None}
 
 
 def refusal(model: Model) -> str | None:

@@ -60,6 +60,15 @@ class Named:
         """name@where."""
         return self.effect.key
 
+    @property
+    def sizes(self) -> dict[str, tuple[float, float, str]]:
+        """Value, 1σ and unit of each parameter, or of each constant where it has none."""
+        if self.parameters:
+            read = zip(self.values.tolist(), self.stds.tolist(), self.units, strict=True)
+            return dict(zip(self.parameters, read, strict=True))
+        said = self.coefficients.items()
+        return {f"{self.key}.{name}": (value, std, unit) for name, (value, std, unit) in said if std is not None}
+
 
 @dataclass(frozen=True)
 class Outcome:

@@ -213,7 +213,7 @@ class Estimator(Stage):
         if self.smoother is not None and self.by_smoother:
             return self.smoother.end
         if self.momentum is not None and self.by_momentum:
-            return self.momentum.newest_row
+            return self.momentum.state.newest_row
         return self.energy.state.newest_row
 
     @property

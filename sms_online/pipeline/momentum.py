@@ -101,11 +101,6 @@ class Momentum(Stage):
         self._build()
 
     @property
-    def newest_row(self) -> float:
-        """Time of the last window's end, s; -inf before the first."""
-        return self.state.newest_row
-
-    @property
     def sensor_noise(self) -> SensorNoise | None:
         """Noise of the sensors as estimated last, None while it is not known."""
         return self.state.sensor_noise
