@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -48,20 +47,7 @@ class Fit:
 
     @staticmethod
     def _of(document: Mapping[str, Any]) -> Fit:
-        parameters = Parameters(
-            Parameter(
-                name=p["name"],
-                symbol=p["symbol"],
-                unit=p["unit"],
-                value=p["estimate"],
-                std=math.inf if p["std"] is None else p["std"],
-                determined=p["identifiable"],
-                nominal=p["nominal"],
-                true=p["true"],
-                projected=p.get("projected"),
-            )
-            for p in document["parameters"]
-        )
+        parameters = Parameters(map(Parameter.of, document["parameters"]))
         fit, held_out = ({row: Residual(**r) for row, r in document[part].items()} for part in ("fit", "holdout"))
         return Fit(parameters, fit, held_out, dict(document["limit"]))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -53,6 +54,22 @@ class Parameter:
     true: float | None = None
     bound: float | None = None
     projected: float | None = None
+
+    @staticmethod
+    def of(document: Mapping[str, Any]) -> Parameter:
+        """The parameter of an entry `parameters` of results.json or diagnosis.json."""
+        return Parameter(
+            name=document["name"],
+            symbol=document["symbol"],
+            unit=document["unit"],
+            value=document["estimate"],
+            std=math.inf if document["std"] is None else document["std"],
+            determined=document["identifiable"],
+            nominal=document["nominal"],
+            true=document["true"],
+            bound=document.get("bound"),
+            projected=document.get("projected"),
+        )
 
     @property
     def interval(self) -> tuple[float, float]:

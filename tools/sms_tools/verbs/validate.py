@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
 from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.runs import read_results
 from sms_adapters.session_log import SYSTEM
@@ -48,9 +46,6 @@ def _described(args: argparse.Namespace) -> tuple[System, Parameters | None, dic
         system, folder = described_system(args)
         return system, None, {}, folder
     document = read_results(path)
-    values = Parameters(
-        Parameter(p["name"], p["symbol"], p["unit"], p["estimate"], p["std"] or np.inf, p["identifiable"])
-        for p in document["parameters"]
-    )
+    values = Parameters(Parameter.of(p | {"std": p["std"] or None}) for p in document["parameters"])
     gains = {each["where"]: float(each["estimate"]) for each in document["calibration"] if each["name"] == GAIN}
     return System.model_validate(document["system"]), values, gains, None
