@@ -24,10 +24,6 @@ from sms_online.stream import Source
 Reader = Callable[[Path, System, Callable[[int], None] | None, Path | None], Source]
 
 
-def _log(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
-    return LogReader(path, system, on_bytes)
-
-
 def _csv(path: Path, system: System, on_bytes: Callable[[int], None] | None, directory: Path | None) -> Source:
     """A capture, python-can's CAN log, or a table: by the header, and by whether the system describes a table."""
     described = any(isinstance(source, TableSource) for source in system.sources)
@@ -46,7 +42,9 @@ def _csv(path: Path, system: System, on_bytes: Callable[[int], None] | None, dir
 READERS: dict[str, Reader] = {
     ".csv": _csv,
     **dict.fromkeys((".log", ".asc", ".trc", ".blf", ".mf4"), CanLogReader),
-    **dict.fromkeys((*PARQUET_ENDINGS, *ARRAY_ENDINGS), _log),
+    **dict.fromkeys(
+        (*PARQUET_ENDINGS, *ARRAY_ENDINGS), lambda path, system, on_bytes, _: LogReader(path, system, on_bytes)
+    ),
 }
 COMPRESSED = (".csv", ".log", ".asc", ".trc")
 NAMES = f"a name ending in {', '.join(READERS)} (or .gz of text), .mcap, .bag or .db3, or a recording"

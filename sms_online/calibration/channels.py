@@ -129,22 +129,14 @@ def _torques(sensing: Sensing, tolerances: Tolerances) -> list[Family]:
     return [
         Family(
             tuple(Nuisance("drive_gain", f"joint_{i + 1}", "", tolerances.drive_gain, part) for i in gained),
-            partial(_of_torque, gained),
+            partial(_of_torque, np.positive, gained),
             tuple(Multiplied(None, joints=(i,)) for i in gained),
         ),
         Family(
             tuple(Nuisance("drive_offset", f"joint_{i + 1}", units[i], offset) for i in shifted),
-            partial(_one_torque, shifted),
+            partial(_of_torque, np.ones_like, shifted),
         ),
     ]
-
-
-def _of_torque(joints: Sequence[int], motion: Motion) -> Array:
-    return motion.torque[:, :, None] * np.eye(motion.torque.shape[1])[:, list(joints)]
-
-
-def _one_torque(joints: Sequence[int], motion: Motion) -> Array:
-    return np.ones_like(motion.torque)[:, :, None] * np.eye(motion.torque.shape[1])[:, list(joints)]
 
 
 def _clocks(sensing: Sensing, names: Sequence[str], tolerance: float) -> Iterator[Family]:
@@ -182,7 +174,7 @@ def _encoders(sensing: Sensing, names: Sequence[str], tolerances: Tolerances) ->
     yield Family(tuple(mounts), partial(_constant, turned))
     for part, wave in (("sine", np.sin), ("cosine", np.cos)):
         waves = [Nuisance("once_per_turn", names[k], "rad", tolerances.once_per_turn, part) for k in turning]
-        yield Family(tuple(waves), partial(_wave, wave, turn))
+        yield Family(tuple(waves), partial(_times, wave, turn))
 
 
 def _markers(names: Sequence[str], tolerances: Tolerances) -> Iterator[Family]:
@@ -236,8 +228,14 @@ def _selection(names: Sequence[str], chosen: Sequence[int]) -> Array:
     return np.eye(len(names))[:, list(chosen)]
 
 
-def _wave(wave: np.ufunc, selection: Array, motion: Motion) -> Array:
-    return np.asarray(wave(motion.readings)[:, :, None] * selection)
+def _times(function: Callable[[Array], Array], selection: Array, motion: Motion) -> Array:
+    """A function of each reading, of some sensors alone."""
+    return np.asarray(function(motion.readings)[:, :, None] * selection)
+
+
+def _of_torque(function: Callable[[Array], Array], joints: Sequence[int], motion: Motion) -> Array:
+    """A function of each torque, of some joints alone."""
+    return function(motion.torque)[:, :, None] * np.eye(motion.torque.shape[1])[:, list(joints)]
 
 
 def _constant(selection: Array, motion: Motion) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -22,10 +21,6 @@ from sms_online.verdict.judged import evaluated
 # What is found may leave so many times of the held-out torque that the description leaves: of rows without a torque it
 # may explain all, and torques of noise differ by less.
 WORSE = 1.1
-
-
-def _trial(attempt: Attempt, forces: Sequence[Effect], constants: Sequence[Effect], beta: Array) -> Attempt:
-    return attempt.trial(attempt.system, constants, beta, forces)
 
 
 def with_constants(
@@ -68,7 +63,11 @@ def _improved(case: Case, attempt: Attempt, chosen: Sequence[int]) -> ConstantsS
     solution = attempt.solution(chosen)
     fresh, forces = attempt.found(chosen, solution)
     beta = solution[: attempt.rows.base.n]
-    for correction in corrections(partial(_trial, attempt, forces), [*attempt.constants, *fresh], beta):
+
+    def trial(constants: Sequence[Effect], beta: Array) -> Attempt:
+        return attempt.trial(attempt.system, constants, beta, forces)
+
+    for correction in corrections(trial, [*attempt.constants, *fresh], beta):
         if correction.converged or case.stop():
             break
     return correction

@@ -102,35 +102,24 @@ def _variables(rows: SessionRows, speed: int) -> dict[str, Variable]:
     Not the torque on that very speed, which explains itself, with an arm that has no mass.
     """
     layout = rows.model.layout
-    out: dict[str, Variable] = {}
-    for k, name in enumerate(layout.position_names):
-        out[name] = _position(k)
-    for k, name in enumerate(layout.speed_names):
-        out[f"rate of {name}"] = _speed(k)
+    out = {name: _part("x", k) for k, name in enumerate(layout.position_names)}
+    out |= {f"rate of {name}": _part("v", k) for k, name in enumerate(layout.speed_names)}
     for i, (q, theta_m) in enumerate(zip(layout.q, layout.theta_m, strict=True)):
         if q != theta_m:
             out[f"deflection of joint_{i + 1}"] = _difference(theta_m + layout.offset, q + layout.offset)
         if speed not in (q, theta_m):
-            out[f"torque of joint_{i + 1}"] = _torque(i)
+            out[f"torque of joint_{i + 1}"] = _part("torque", i)
     rate = rows.model.system.sample_rate
     out["time"] = lambda motion: (rows.segments[motion.segment].index[0] + motion.samples) / rate
     return out
 
 
-def _position(k: int) -> Variable:
-    return lambda motion: motion.x[:, k]
-
-
-def _speed(k: int) -> Variable:
-    return lambda motion: motion.v[:, k]
+def _part(part: str, k: int) -> Variable:
+    return lambda motion: getattr(motion, part)[:, k]
 
 
 def _difference(k: int, minus: int) -> Variable:
     return lambda motion: motion.x[:, k] - motion.x[:, minus]
-
-
-def _torque(i: int) -> Variable:
-    return lambda motion: motion.torque[:, i]
 
 
 def _knots(rows: SessionRows, variable: Variable) -> Array | None:

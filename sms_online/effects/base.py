@@ -59,6 +59,11 @@ class Ranges:
     sample_rate: float
 
 
+def shares_of(size: str, *shares: float) -> Callable[[Ranges], tuple[float, ...]]:
+    """A grid of shares of a motion's range."""
+    return lambda ranges: tuple(share * getattr(ranges, size) for share in shares)
+
+
 @dataclass(frozen=True)
 class Shape:
     """A shape constant: unit, value where none is given, and the values to search for a motion's ranges.

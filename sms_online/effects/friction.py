@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sms_online.description.channels import has_motor_side
-from sms_online.effects.base import STANDSTILL, Entry, Force, Ranges, Shape, Site, dahl_rate, deflection
+from sms_online.effects.base import STANDSTILL, Entry, Force, Shape, Site, dahl_rate, deflection, shares_of
 from sms_online.effects.traits import Curve, Traits
 from sms_online.model.effect import Inputs
 from sms_online.model.layout import Layout
@@ -81,10 +81,6 @@ class CoulombFriction(MotorSide):
         return -sign(self.rate(layout, v))[:, None]
 
 
-def _stribeck_velocities(ranges: Ranges) -> tuple[float, ...]:
-    return tuple(share * ranges.speed for share in (0.01, 0.03, 0.1, 0.2, 0.4))
-
-
 class StribeckFriction(MotorSide):
     """f = -c sign(θ̇_m) exp(-(θ̇_m / v_s)²): what friction loses as the axis picks up speed.
 
@@ -94,7 +90,7 @@ class StribeckFriction(MotorSide):
 
     entry = Entry(
         "stribeck_friction", "force", "joint", {"torque": "N m"}, "slow motion through standstill, and fast motion",
-        {"velocity": Shape("rad/s", 0.05, _stribeck_velocities)},
+        {"velocity": Shape("rad/s", 0.05, shares_of("speed", 0.01, 0.03, 0.1, 0.2, 0.4))},
         traits=Traits(course="dry", curve=Curve("motor speed")),
     )  # fmt: skip
 
@@ -121,10 +117,6 @@ class DahlFriction(MotorSide):
         return dahl_rate(self.rate(layout, v), z, self.shapes["width"])
 
 
-def _presliding_widths(ranges: Ranges) -> tuple[float, ...]:
-    return tuple(share * ranges.swing for share in (0.0003, 0.001, 0.003, 0.01, 0.03))
-
-
 class PreslidingFriction(DahlFriction):
     """f = -c z / w with ż = θ̇_m - |θ̇_m| z / w: friction that builds up over a way, and remembers where it comes from.
 
@@ -136,7 +128,7 @@ class PreslidingFriction(DahlFriction):
     entry = Entry(
         "presliding_friction", "force", "joint", {"torque": "N m"},
         "slow reversals with small and large motion between them",
-        {"width": Shape("rad", 0.001, _presliding_widths)},
+        {"width": Shape("rad", 0.001, shares_of("swing", 0.0003, 0.001, 0.003, 0.01, 0.03))},
     )  # fmt: skip
     symbols = ("c_p{}",)
 

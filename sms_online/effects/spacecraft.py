@@ -146,10 +146,6 @@ class RotationalDrag(Force):
         return f
 
 
-def _nowhere_else(ranges: Ranges) -> tuple[float, ...]:
-    return (0.0,)
-
-
 class CableSpring(Force):
     """f = -c (r_S - r_0), c `stiffness` in N/m: a cable that pulls the base back to where it hangs slack.
 
@@ -159,7 +155,7 @@ class CableSpring(Force):
 
     entry = Entry(
         "cable_spring", "force", "base", {"stiffness": "N/m"}, "travel of the base to both sides, held there",
-        {f"rest_{axis}": Shape("m", 0.0, _nowhere_else) for axis in AXES},
+        {f"rest_{axis}": Shape("m", 0.0, lambda ranges: (0.0,)) for axis in AXES},
     )  # fmt: skip
     symbols = ("c_0",)
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sms_online.effects.base import Entry, Ranges, Shape, Site, deflection, position
+from sms_online.effects.base import Entry, Shape, Site, deflection, position, shares_of
 from sms_online.effects.friction import DahlFriction, MotorSide
 from sms_online.effects.harmonic import amplitude_and_phase, nominal_parts, phase_columns
 from sms_online.effects.traits import Curve, Traits
@@ -20,6 +20,8 @@ from sms_online.stream import Array
 
 # Gears are true to arc minutes; 0.1 rad would be seen by eye.
 LARGEST_ERROR = 0.1
+# Widths of gaps and of hysteresis to try.
+WIDTHS = shares_of("deflection", 0.01, 0.03, 0.1, 0.3)
 
 
 class Transmission(MotorSide):
@@ -36,10 +38,6 @@ class Transmission(MotorSide):
         return v[:, layout.theta_m[self.index - 1]] - v[:, layout.q[self.index - 1]]
 
 
-def _widths(ranges: Ranges) -> tuple[float, ...]:
-    return tuple(share * ranges.deflection for share in (0.01, 0.03, 0.1, 0.3))
-
-
 class TorsionalHysteresis(Transmission, DahlFriction):
     """f = -c z / δ_s along δ with ż = δ̇ - |δ̇| z / δ_s: the spring's torque depends on where it comes from.
 
@@ -50,7 +48,7 @@ class TorsionalHysteresis(Transmission, DahlFriction):
     entry = Entry(
         "torsional_hysteresis", "force", "flexible joint", {"torque": "N m"},
         "slow load cycles of two amplitudes: damping fades with speed, hysteresis does not",
-        {"width": Shape("rad", 0.01, _widths)},
+        {"width": Shape("rad", 0.01, WIDTHS)},
     )  # fmt: skip
     symbols = ("h_{}",)
 
@@ -83,7 +81,7 @@ class Backlash(Transmission):
 
     entry = Entry(
         "backlash", "force", "flexible joint", {"gap": "rad"}, "deflections within and far beyond the gap",
-        {"gap": Shape("rad", 0.001, _widths)}, {"stiffness": "N m/rad"},
+        {"gap": Shape("rad", 0.001, WIDTHS)}, {"stiffness": "N m/rad"},
         Traits(curve=Curve("deflection", between=True)),
     )  # fmt: skip
 

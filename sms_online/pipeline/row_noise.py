@@ -107,7 +107,8 @@ class RowNoise(Stage):
         """c (W, STEPS + 1, n_v, ·) of a lateness δ(t) of each device whose stamps jitter; rates as in `lateness`."""
         between = np.repeat(rates, 2, axis=1)[:, :-1]
         between[:, 1::2] = 0.5 * (rates[:, :-1] + rates[:, 1:])
-        each = [np.einsum("wkvs,wks->wkv", kernels[..., own], between[..., own]) for own in map(_sensors, jitters)]
+        devices = [list(jitter.sensors) for jitter in jitters]
+        each = [np.einsum("wkvs,wks->wkv", kernels[..., own], between[..., own]) for own in devices]
         return np.stack(each, axis=3) if each else kernels[..., :0]
 
     def covariances(
@@ -178,10 +179,6 @@ def common(free: Array, before: Array, hops: int) -> Array:
     """
     later = hops * (INSTANTS // HOPS)
     return np.asarray(np.sum(free[:, : INSTANTS - later] * before[:, later:], axis=1))
-
-
-def _sensors(jitter: Jitter) -> list[int]:
-    return list(jitter.sensors)
 
 
 def _interpolation(at: Array, nodes: Array) -> Array:

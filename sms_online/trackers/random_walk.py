@@ -59,21 +59,16 @@ class RandomWalk(Tracker):
         estimate = self._squares.estimate()
         if not estimate.determined.all() or estimate.dof <= 0.0:
             return
-        self._begin_filter(estimate.pi, INITIAL * estimate.std)
+        self.state.value, self.state.std = estimate.pi, INITIAL * estimate.std
+        self.renew()
         assert self._filter is not None
         self._filter.begin(known)
-
-    def _begin_filter(self, value: Array, std: Array) -> None:
-        self.state.value, self.state.std = value, std
-        self.renew()
 
     def renew(self) -> None:
         """See Stage."""
         value, std = self.state.value, self.state.std
-        self._filter = None if value is None or std is None else self._at(value, std)
-
-    def _at(self, value: Array, std: Array) -> KalmanTracker:
-        return KalmanTracker(self._n, self._process_std, Prior(value, std))
+        known = None if value is None or std is None else Prior(value, std)
+        self._filter = None if known is None else KalmanTracker(self._n, self._process_std, known)
 
     def estimate(self) -> Estimate:
         """The estimate from all rows; leaves the state as it is."""

@@ -178,15 +178,12 @@ def _drift_line(d: Document) -> str:
     return f"{line}, {value} ± {d['value_std']:.2g} {d['unit']} now"
 
 
-def _calibration(document: Document) -> list[Calibration]:
-    return [Calibration(**entry) for entry in document.get("calibration", [])]
-
-
 def trust_lines(document: Document) -> list[str]:
     """Events, calibration, residual, condition number, amount of data, throughput and warnings, a line each."""
     lines = [event_line(event) for event in document["events"]] + drift_lines(document)
     lines += [f"diagnosis: {episode['summary']}" for episode in document.get("diagnosis", [])]
-    lines += [f"calibration: {each}" for each in _calibration(document) if each.certain]
+    calibration = [Calibration(**entry) for entry in document.get("calibration", [])]
+    lines += [f"calibration: {each}" for each in calibration if each.certain]
     for rows, residual in document["residual"].items():
         if residual["relative"] is not None:
             lines.append(f"residual {rows}: {residual['relative']:.3g} of the measured torque or force")
