@@ -12,7 +12,6 @@ import io
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,8 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from sms_tools.cli import main as sms_online
+from sms_tools.view.choice import LOOPBACK
+from sms_tools.view.sink import free_port
 
 PICTURES = Path(__file__).parent.parent / "docs" / "pictures"
 # px, of a screenshot: large enough for every title, small enough to be read where a page scales it to half.
@@ -81,7 +82,7 @@ def _diagnosis(capture: Path) -> None:
 def _photograph(recording: Path, picture: Path) -> None:
     # The viewer lies beside the interpreter, whether or not that directory is in PATH. `ViewerClient.spawn` would
     # start one of another size.
-    port = _free_port()
+    port = free_port(0, LOOPBACK)
     program = [Path(sys.executable).with_name("rerun"), "--headless", "--port", str(port)]
     size = ["--window-size", f"{WIDTH}x{HEIGHT}"]
     process = subprocess.Popen([*program, *size], stderr=subprocess.DEVNULL, start_new_session=True)
@@ -97,12 +98,6 @@ def _photograph(recording: Path, picture: Path) -> None:
         # That program is a script, which starts the viewer itself.
         os.killpg(process.pid, signal.SIGTERM)
         process.wait()
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _connected(url: str) -> ViewerClient:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from sms_adapters.extras import installed
 from sms_adapters.importers import load_matlab
-from sms_adapters.log_tables import ROWS, Chunk, missing
+from sms_adapters.log_tables import ROWS, Chunk, WholeTable, missing
 from sms_adapters.raw import one_line
 from sms_online.errors import InputError
 
@@ -34,17 +33,11 @@ class _Field:
         return self._table[rows][self._field]
 
 
-class ArrayTable:
+class ArrayTable(WholeTable):
     """Arrays of an HDF5 file, which a .mat of version 7.3 is too, or of an older .mat: a `Table`.
 
     Limitation: an older .mat is read variable by variable, each as a whole.
     """
-
-    warnings = ()
-
-    def __init__(self, path: Path, on_bytes: Callable[[int], None] | None) -> None:
-        self._path = path
-        self._on_bytes = on_bytes
 
     def chunks(self, stamp: str, columns: Sequence[str]) -> Iterator[Chunk]:
         """See `Table`."""

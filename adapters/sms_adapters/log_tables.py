@@ -54,14 +54,18 @@ def stamps_of(column: pa.Array | pa.ChunkedArray) -> NDArray[Any]:
     return stamps
 
 
-class ParquetTable:
-    """A Parquet file, a batch of rows at a time: a `Table`."""
+class WholeTable:
+    """A file of columns of which nothing is left out. on_bytes: called with the bytes consumed so far."""
 
     warnings = ()
 
     def __init__(self, path: Path, on_bytes: Callable[[int], None] | None) -> None:
         self._path = path
         self._on_bytes = on_bytes
+
+
+class ParquetTable(WholeTable):
+    """A Parquet file, a batch of rows at a time: a `Table`."""
 
     def chunks(self, stamp: str, columns: Sequence[str]) -> Iterator[Chunk]:
         """See `Table`."""

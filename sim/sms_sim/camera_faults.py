@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sms_online.description.channels import AXES
 from sms_online.errors import InputError
 from sms_online.grouping import grouped
 from sms_online.stream import Block
@@ -19,8 +20,6 @@ GRAMMAR = (
     "or swapped@MARKER+MARKER:begin=SECONDS,over=SECONDS, with markers such as link_1.marker_2 or link_1.*"
 )
 KEYS = {"missing": ("share",), "hidden": ("begin", "over"), "swapped": ("begin", "over")}
-# Last part of a point's channel.
-AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from sms_online.description.channels import drive_channels, sensed_channels, wre
 from sms_online.description.schema import Sensor, System
 from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
+from sms_online.pipeline.sensing import EULER_PARAMETERS
 from sms_online.stream import Array
 
 
@@ -34,7 +35,6 @@ GRADES = {
     "C": Grade(encoder=1e-4, marker=1e-3, torque=0.5),
 }
 ENCODERS = ("q_", "theta_m_", "theta_0")
-EULER_PARAMETERS = ("eps_x", "eps_y", "eps_z", "eta")
 
 
 class Sensors:

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from sms_online.pipeline.gram_sum import ROUNDED
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.pipeline.prior_information import WIDENED, Penalty, PriorInformation
 from sms_online.pipeline.row_grams import RowGrams
@@ -43,8 +44,6 @@ CONVERGED, MOST_STEPS = 1e-6, 100
 LEAST_CURVATURE = 1e-2
 # Noise in whitened rows below this share of their variance is none: their weights follow from the rest of it.
 LEAST_NOISE = 0.1
-# Rounding of a sum of products, in units of its last place.
-ROUNDED = 16.0
 # A step is halved until it gains this share of what the slope promises, so many times at most.
 SUFFICIENT, HALVINGS = 1e-4, 30
 

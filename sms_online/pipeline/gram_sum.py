@@ -14,6 +14,8 @@ from sms_online.stream import Array
 
 # Windows that are added together: of one alone, reading and writing the sum costs more than the products.
 GATHERED = 16
+# Rounding of a sum of products, in units of its last place.
+ROUNDED = 16.0
 
 
 class GramSum(State):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtri
 
-from sms_online.pipeline.gram_sum import GramSum
+from sms_online.pipeline.gram_sum import ROUNDED, GramSum
 from sms_online.pipeline.momentum_windows import OVERLAP
 from sms_online.state import State
 from sms_online.stream import Array
@@ -15,8 +15,6 @@ from sms_online.stream import Array
 LARGEST_RATIO = 2.0
 # Few windows exceed it by chance: that one of all speeds does has at most this probability.
 CHANCE = 1e-3
-# Rounding of a sum of products, in units of its last place.
-ROUNDED = 16.0
 
 
 class PlainRows(State):

@@ -38,9 +38,13 @@ class FadingForgetting(Protocol):
         """
 
 
-def _check_factor(factor: float) -> None:
-    if not 0 < factor < 1:
-        raise ValueError(f"forgetting factor {factor:g}; expected between 0 and 1")
+@dataclass(frozen=True)
+class _ByFactor:
+    factor: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.factor < 1:
+            raise ValueError(f"forgetting factor {self.factor:g}; expected between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class SlidingWindow:
 
 
 @dataclass(frozen=True)
-class Exponential:
+class Exponential(_ByFactor):
     """Each row counts `factor` times the next one, down to a floor: selective forgetting on the singular values of R.
 
     In coordinates scaled by the peak column norms, R = U s Vᵀ, a singular value becomes max(√weight·s, min(s, floor)).
@@ -75,11 +79,6 @@ class Exponential:
     Source: Parkum, Poulsen and Holst, Int. J. Control 55 (1992) 109–128.
     Limitation: a single gross outlier in Y raises the peak, and with it the floor, until reset.
     """
-
-    factor: float
-
-    def __post_init__(self) -> None:
-        _check_factor(self.factor)
 
     def row_weights(self, rows: int) -> Array:
         """Geometric within the block as well: exactly row-by-row weighting while the floor is not reached."""
@@ -99,7 +98,7 @@ class Exponential:
 
 
 @dataclass(frozen=True)
-class Directional:
+class Directional(_ByFactor):
     """Fades by `factor` a row, but only in the directions that the block excites: the rest is kept for ever.
 
     With V the block's excited directions the information loses (1 − weight) Λ V (Vᵀ Λ V)⁻¹ Vᵀ Λ, which in square-root
@@ -107,11 +106,6 @@ class Directional:
     Source: Cao and Schwartz, Automatica 36 (2000) 1725–1731, for one row; Lai and Bernstein, SIFt-RLS,
     arXiv:2404.10844 (2024), for several, with two-sided bounds of the information without persistent excitation.
     """
-
-    factor: float
-
-    def __post_init__(self) -> None:
-        _check_factor(self.factor)
 
     def row_weights(self, rows: int) -> Array:
         """Rows of one block count the same: what excites a direction first must not fade before it is counted."""

@@ -64,7 +64,7 @@ class Sink:
         if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in SCREENS):
             # The viewer would listen, take the first data, and die.
             raise TroubleError("no screen to open a viewer on; --rerun serve shows it in a browser")
-        port = _free_port(GRPC_PORT, LOOPBACK)
+        port = free_port(GRPC_PORT, LOOPBACK)
         command = [str(RERUN), "--bind", LOOPBACK, "--port", str(port), "--expect-data-soon"]
         viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
         self._await_listening(viewer, LOOPBACK, port, "rerun's viewer does not start")
@@ -84,7 +84,7 @@ class Sink:
         It stays in this process's group, with which the session ends it.
         """
         address = self.choice.host
-        port, page = _free_port(GRPC_PORT, address), _free_port(WEB_PORT, address)
+        port, page = free_port(GRPC_PORT, address), free_port(WEB_PORT, address)
         command = [str(RERUN), "--serve-web", "--bind", address, "--server-memory-limit", SERVER_MEMORY]
         command += ["--port", str(port), "--web-viewer-port", str(page)]
         open_to_others = not ip_address(address).is_loopback
@@ -140,7 +140,7 @@ def _listens(address: str, port: int) -> bool:
         return probe.connect_ex((address, port)) == 0
 
 
-def _free_port(wanted: int, address: str) -> int:
+def free_port(wanted: int, address: str) -> int:
     """The wanted port at an address of this machine, or any free one where that is taken."""
     for port in (wanted, 0):
         with socket.socket() as probe:
