@@ -23,6 +23,7 @@ from sms_online.history import HistoryRecorder
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
 from sms_online.priors import GivenPrior, base_prior, given_prior
+from sms_online.recorded import Recorded
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
 from sms_online.stream import Array, Block
@@ -232,10 +233,24 @@ def estimate(
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)
-    source = recorded.source
+    session, record = session_of(system, recorded, prior, adopt, bound, tracker)
+    for block in recorded.source:
+        session.update(block)
+    session.finish()
+    least = None if record is None else session_bound(session.estimator, record)
+    return session.evaluate(recorded.truth, least, recorded.source.warnings)
+
+
+def session_of(
+    system: System, recorded: Recorded, prior: GivenPrior, adopt: bool, bound: bool, tracker: Trackers
+) -> tuple[Session, MotionRecord | None]:
+    """The session of a recording as it was begun, before its first sample; with what a bound follows from, if wanted.
+
+    prior, adopt, tracker: as for `Session`; the recorded trackers unless given.
+    """
     session = Session(
         system,
-        source.channels,
+        recorded.source.channels,
         prior=prior,
         adopt=adopt,
         tracker=recorded.trackers if tracker is None else tracker,
@@ -246,8 +261,4 @@ def estimate(
     record = MotionRecord(system.sample_rate) if bound else None
     if record is not None:
         session.estimator.observers.append(record)
-    for block in source:
-        session.update(block)
-    session.finish()
-    least = None if record is None else session_bound(session.estimator, record)
-    return session.evaluate(recorded.truth, least, source.warnings)
+    return session, record

@@ -11,9 +11,9 @@ from time import perf_counter
 from sms_adapters.data_check import ChannelChecks, Checked
 from sms_adapters.recorded import recorded_at
 from sms_online.capture import PIECE
-from sms_online.cramer_rao import MotionRecord, session_bound
+from sms_online.cramer_rao import session_bound
 from sms_online.errors import InputError
-from sms_online.session import Session
+from sms_online.session import session_of
 from sms_online.stream import Block
 from sms_tools.interruption import Interruption
 from sms_tools.results_file import results_directory
@@ -36,19 +36,7 @@ def run(args: argparse.Namespace) -> int:
         with watched(capture, system, folder, args.start, args.stop) as reading:
             source = reading.source
             recorded = recorded_at(capture, source, whole=args.start is args.stop is None)
-            session = Session(
-                system,
-                source.channels,
-                prior=args.prior,
-                adopt=args.adopt,
-                tracker=recorded.trackers if args.tracker is None else None,
-                source=recorded.name,
-                searcher=recorded.searcher(args.adopt),
-                checkpoint=recorded.checkpoint,
-            )
-            record = MotionRecord(system.sample_rate) if args.bound else None
-            if record is not None:
-                session.estimator.observers.append(record)
+            session, record = session_of(system, recorded, args.prior, args.adopt, args.bound, args.tracker)
             patient = args.speed == "max"
             rows = PIECE if patient else max(1, round(PACE * system.sample_rate))
             pieces = (piece for block in reading for piece in block.pieces(rows))
