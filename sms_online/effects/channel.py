@@ -12,6 +12,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from sms_online.effects.base import Constant, Entry, beyond_zero
+from sms_online.effects.harmonic import amplitude_and_phase
 from sms_online.effects.traits import Traits
 from sms_online.stream import Array
 
@@ -45,8 +46,9 @@ class ChannelEffect(Constant):
     linear: ClassVar[tuple[Linear, ...]]
     filtered: ClassVar[bool] = False
 
-    def __init__(self, name: str, where: str, coefficients: Mapping[str, float]) -> None:
-        self.name, self.where, self.coefficients = name, where, coefficients
+    def __init__(self, where: str, given: Mapping[str, float]) -> None:
+        self.name, self.where = self.entry.name, where
+        self.coefficients = {name: given.get(name, 0.0) for name in self.entry.coefficients}
 
     @property
     def latency(self) -> float:
@@ -86,9 +88,6 @@ class EncoderOffset(ChannelEffect):
     )  # fmt: skip
     linear = (Linear("offset", "rad", "one", -1.0),)
 
-    def __init__(self, where: str, given: Mapping[str, float]) -> None:
-        super().__init__(self.entry.name, where, {"offset": given.get("offset", 0.0)})
-
     def distort(self, samples: Array, sample_rate: float) -> Array:
         """x + c."""
         return samples + self.coefficients["offset"]
@@ -110,10 +109,6 @@ class EncoderEccentricity(ChannelEffect):
         traits=Traits(signed=True, most=LARGEST_ECCENTRICITY, calibrates=("once_per_turn",)),
     )  # fmt: skip
     linear = (Linear("sine", "rad", "sine", -1.0), Linear("cosine", "rad", "cosine", -1.0))
-
-    def __init__(self, where: str, given: Mapping[str, float]) -> None:
-        stated = {"amplitude": given.get("amplitude", 0.0), "phase": given.get("phase", 0.0)}
-        super().__init__(self.entry.name, where, stated)
 
     def _error(self, angle: Array) -> Array:
         return np.asarray(self.coefficients["amplitude"] * np.sin(angle + self.coefficients["phase"]))
@@ -139,7 +134,7 @@ class EncoderEccentricity(ChannelEffect):
         """Sine and cosine parts changed."""
         a, phi = given.get("amplitude", 0.0), given.get("phase", 0.0)
         sine, cosine = a * np.cos(phi) + increments[0], a * np.sin(phi) + increments[1]
-        return {"amplitude": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
+        return amplitude_and_phase(np.array((sine, cosine)))
 
     @classmethod
     def deviations(cls, given: Mapping[str, float], covariance: Array) -> dict[str, float]:

@@ -75,9 +75,6 @@ class SensorLag(Convolved):
     linear = (Linear("delay", "s", "rate", 1.0),)
     filtered = True
 
-    def __init__(self, where: str, given: Mapping[str, float]) -> None:
-        super().__init__(self.entry.name, where, {"corner": given["corner"]})
-
     @property
     def omega(self) -> float:
         """ω, rad/s."""
@@ -134,9 +131,6 @@ class TorqueDelay(Convolved):
         traits=Traits(least=SHORTEST_TORQUE_DELAY, most=LONGEST_FOUND, calibrates=("clock",)),
     )  # fmt: skip
     linear = (Linear("time", "s", "torque rate", -1.0),)
-
-    def __init__(self, where: str, given: Mapping[str, float]) -> None:
-        super().__init__(self.entry.name, where, {"time": given.get("time", 0.0)})
 
     @property
     def latency(self) -> float:
@@ -197,7 +191,7 @@ class SensorLatency(Convolved):
     """
 
     def __init__(self, patterns: tuple[str, ...], latency: float) -> None:
-        super().__init__("latency", ", ".join(patterns), {"time": latency})
+        self.name, self.where, self.coefficients = "latency", ", ".join(patterns), {"time": latency}
         self._patterns = patterns
 
     def acts_on(self, channel: str) -> bool:
