@@ -6,7 +6,9 @@ import re
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
 
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.stamp_jitter import Jitter, JitterState, jitters, left_and_rates, noise_beside, pair_sums
@@ -33,8 +35,31 @@ def samples(random: np.random.Generator, jitter: float, wobble: float = 0.0) -> 
 
 
 def found(t: Array, values: Array) -> tuple[Jitter, ...]:
-    state = JitterState.none(4).with_sums(*pair_sums(*left_and_rates(values, t)), np.arange(4))
-    return jitters(state, DEVICES, np.full(4, 1.0 / RATE))
+    return found_of(t, values, np.zeros(4, dtype=bool), DEVICES)
+
+
+def found_of(
+    t: Array, values: Array, quaternion: NDArray[np.bool_], devices: list[tuple[str, list[int]]]
+) -> tuple[Jitter, ...]:
+    sensors = values.shape[1]
+    sums = pair_sums(*left_and_rates(values, t), quaternion)
+    state = JitterState.none(sensors).with_sums(*sums, np.arange(sensors))
+    return jitters(state, devices, np.full(sensors, 1.0 / RATE))
+
+
+@pytest.mark.parametrize(("jitter", "names"), [(0.0, []), (5e-4, ["camera"])])
+def test_noise_of_a_unit_quaternion_is_no_jitter(jitter: float, names: list[str]) -> None:
+    """Its parts have noise in common, for a camera's angles are noisy and not they."""
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        t = np.arange(4000) / RATE
+        at = (t - jitter * random.standard_normal(t.size))[:, None]
+        turned = Rotation.from_rotvec([0.6, 0.5, 0.8] * np.sin([1.3, 1.9, 1.1] * at + [0.0, 1.0, 2.0]))
+        seen = turned * Rotation.from_rotvec(3e-4 * random.standard_normal((t.size, 3)))
+        place = 0.3 * np.sin([0.7, 0.9, 1.3] * at) + 1e-4 * random.standard_normal((t.size, 3))
+        values = np.concatenate((place, seen.as_quat(canonical=True)), axis=1)
+        quaternion = np.arange(7) >= 3
+        assert [each.name for each in found_of(t, values, quaternion, [("camera", list(range(7)))])] == names
 
 
 @pytest.mark.parametrize("size", [1e-4, 5e-4])
@@ -77,7 +102,8 @@ def test_a_constant_channel_shows_no_jitter() -> None:
 
 def test_devices_of_one_clock_have_one_jitter() -> None:
     t, values = samples(np.random.default_rng(1), 3e-4)
-    state = JitterState.none(4).with_sums(*pair_sums(*left_and_rates(values, t)), np.arange(4))
+    sums = pair_sums(*left_and_rates(values, t), np.zeros(4, dtype=bool))
+    state = JitterState.none(4).with_sums(*sums, np.arange(4))
     (jitter,) = jitters(state, [("motors", [0]), ("links", [1]), ("markers", [2, 3])], np.full(4, 1.0 / RATE))
     assert (jitter.name, jitter.sensors) == ("motors and links", (0, 1))
 

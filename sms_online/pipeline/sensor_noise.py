@@ -12,7 +12,7 @@ from sms_online.grouping import grouped
 from sms_online.pipeline.clocks import other_clocks, reference_clock
 from sms_online.pipeline.conditioning import noise_gains
 from sms_online.pipeline.noise import correlation, density_gain, noise_std
-from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensing import EULER_PARAMETERS, Sensing
 from sms_online.pipeline.stamp_jitter import (
     Jitter,
     JitterState,
@@ -192,7 +192,8 @@ class NoiseEstimate(Stage):
             samples = np.stack([self.state.samples[k][1] for k in together], axis=1)
             left, rates = left_and_rates(samples, self.state.samples[together[0]][0])
             own = np.flatnonzero(np.isin(positions, together))
-            self.state.jitter = self.state.jitter.with_sums(*pair_sums(left, rates), own)
+            quaternion = np.isin([self._sensing.channels[k] for k in together], EULER_PARAMETERS)
+            self.state.jitter = self.state.jitter.with_sums(*pair_sums(left, rates, quaternion), own)
             parts |= {k: (left[:, c], rates[:, c]) for c, k in enumerate(together)}
         found = jitters(self.state.jitter, self._devices, period[positions])
         for jitter in found:

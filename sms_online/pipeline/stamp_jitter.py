@@ -2,7 +2,9 @@
 
 A sample that is taken δ later than its stamp says is off by its reading's rate times δ. All channels of a device have
 the same δ, so what is left of two of them after differencing, as `noise` does it, has the covariance σ_t² r_i r_j, r
-the rates. White noise of the sensors has none: only pairs of channels count.
+the rates. White noise of the sensors has none: only pairs of channels count. That of a unit quaternion has one between
+its parts, -σ² q_i q_j / 4 of an angle's noise σ, and over these pairs Σ q_i q_j r_i r_j = -Σ q_i² r_i², as q is normal
+to its rate: such noise would pass for jitter.
 """
 
 from __future__ import annotations
@@ -80,11 +82,12 @@ def left_and_rates(samples: Array, times: Array) -> tuple[Array, Array]:
     return left, np.einsum("kt,ktc->kc", slopes, samples[around])
 
 
-def pair_sums(left: Array, rates: Array) -> tuple[Array, Array]:
+def pair_sums(left: Array, rates: Array, quaternion: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Sums (C, C) over samples: of products of what is left with those of the rates, and of the squares of the latter.
 
-    Both over the variance of what is left: the second is the information on a jitter's square. Products of rates count
-    from their mean: what channels have in common at all rates is no jitter. Zero on the diagonal.
+    quaternion (C,): which channels are its parts, whose pairs do not count. Both sums are over the variance of what is
+    left: the second is the information on a jitter's square. Products of rates count from their mean: what channels
+    have in common at all rates is no jitter. Zero on the diagonal.
     """
     variance = np.mean(left**2, axis=0)
     weight = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > LEAST_VARIANCE)
@@ -92,7 +95,7 @@ def pair_sums(left: Array, rates: Array) -> tuple[Array, Array]:
     mean = rates.T @ rates / len(rates)
     product = (left * rates).T @ (left * rates) - mean * (left.T @ left)
     information = (rates**2).T @ rates**2 - len(rates) * mean**2
-    off = 1.0 - np.eye(len(variance))
+    off = np.where(np.outer(quaternion, quaternion), 0.0, 1.0 - np.eye(len(variance)))
     return off * scale * product, off * scale * np.maximum(information, 0.0)
 
 
