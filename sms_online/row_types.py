@@ -7,6 +7,10 @@ from typing import NamedTuple
 
 from sms_online.model.layout import Layout
 
+# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
+LARGEST_RESIDUAL = 0.5
+# Sessions whose model holds leave up to 1.3 of it. Rows beyond this hold more than noise, and green claims too much.
+NOISE_WHITENED = 1.5
 # Rows of the energy balance.
 ENERGY = "energy"
 
@@ -20,6 +24,16 @@ class Residual(NamedTuple):
 
     relative: float | None
     whitened: float | None
+
+    @property
+    def noise_alone(self) -> bool:
+        """Whether rows hold no more than their sensors' noise."""
+        return self.whitened is not None and self.whitened <= NOISE_WHITENED
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether most of a torque is unexplained, and more than noise."""
+        return self.relative is not None and self.relative > LARGEST_RESIDUAL and not self.noise_alone
 
 
 Residuals = Mapping[str, Residual]  # by type of the rows

@@ -27,17 +27,15 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.torque_gains import GAIN, gain_columns
 from sms_online.result import Parameter, Parameters, Result
-from sms_online.row_types import joint_rows
+from sms_online.row_types import LARGEST_RESIDUAL, NOISE_WHITENED, joint_rows
 from sms_online.stream import Array
 from sms_online.tables import Tabled
 from sms_online.verdict.reasons import (
     DESCRIBE,
     DIAGNOSE,
     LARGEST_DISTANCE,
-    LARGEST_RESIDUAL,
     MOVE,
     NOISE_RESIDUAL,
-    NOISE_WHITENED,
     listed,
 )
 
@@ -151,7 +149,7 @@ class Validation(Tabled):
             return f"The parameters leave no more than noise, but {noise}: {MOVE}."
         noisy = worst.left > NEGLIGIBLE and worst.rows is not None and not worst.rows.beyond
         left = f"at most {100.0 * worst.left:.2g} % of a torque is left ({name})"
-        return f"The parameters hold on this run: {left}{', no more than noise' if noisy else ''}."
+        return f"The parameters hold for the torques of this run: {left}{', no more than noise' if noisy else ''}."
 
     def document(self) -> dict[str, Any]:
         """validation.json as plain dictionaries and numbers."""

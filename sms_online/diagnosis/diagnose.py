@@ -31,12 +31,12 @@ from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.row_types import LARGEST_RESIDUAL
 from sms_online.stream import Block
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
 from sms_online.verdict.judge import at_noise
 from sms_online.verdict.judged import evaluated
-from sms_online.verdict.reasons import LARGEST_RESIDUAL
 
 
 @one_blas_thread()

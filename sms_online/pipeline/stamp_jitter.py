@@ -16,7 +16,7 @@ import numpy as np
 
 from sms_online.pipeline.noise import rough_part
 from sms_online.state import State
-from sms_online.stream import Array, Indices
+from sms_online.stream import Array, Indices, Mask
 
 # Order of the differences: of a vibration at a tenth of the sample rate they leave a ten-thousandth.
 ORDER = 8
@@ -82,7 +82,7 @@ def left_and_rates(samples: Array, times: Array) -> tuple[Array, Array]:
     return left, np.einsum("kt,ktc->kc", slopes, samples[around])
 
 
-def pair_sums(left: Array, rates: Array, quaternion: NDArray[np.bool_]) -> tuple[Array, Array]:
+def pair_sums(left: Array, rates: Array, quaternion: Mask) -> tuple[Array, Array]:
     """Sums (C, C) over samples: of products of what is left with those of the rates, and of the squares of the latter.
 
     quaternion (C,): which channels are its parts, whose pairs do not count. Both sums are over the variance of what is

@@ -87,7 +87,7 @@ def _biased(evidence: Evidence) -> set[str]:
     """
     if not evidence.attenuated:
         return set()
-    return {row for row, each in evidence.residual.items() if reasons.noise_alone(each)}
+    return {row for row, each in evidence.residual.items() if each.noise_alone}
 
 
 def _lasting(evidence: Evidence) -> Residuals:

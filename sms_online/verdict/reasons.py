@@ -7,17 +7,13 @@ from dataclasses import replace
 
 from sms_online.nominal import NominalComparison
 from sms_online.pipeline.tracker_bank import Suspected
-from sms_online.row_types import Residual, Residuals
+from sms_online.row_types import LARGEST_RESIDUAL, NOISE_WHITENED, Residuals
 from sms_online.tracker_results import Consistency
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
 from sms_online.verdict.trust import Reason
 
-# A joint whose unexplained torque reaches this share of the measured one lacks an effect, whatever the error bars say.
-LARGEST_RESIDUAL = 0.5
 # Rows that hold this many times their predicted deviation distort parameters by more than the reported deviations.
 LARGEST_WHITENED = 3.0
-# Sessions whose model holds leave up to 1.3 of it. Rows beyond this hold more than noise, and green claims too much.
-NOISE_WHITENED = 1.5
 # Share of a torque that friction nobody described leaves; more without rows that say it is noise is no green.
 NOISE_RESIDUAL = 0.1
 # Up to here a multiple of the noise is not given: it is rounded to one, or samples are exact and there is no noise.
@@ -40,6 +36,7 @@ IF_NOTHING = f"{DIAGNOSE}; where it finds nothing, and "
 DESCRIBE = "describe what acts there, or let a curve be learned: `sms-online diagnose --learn`"
 NO_CURVE = "no learned curve explains it either: look at what acts there, and at the sensors of these rows"
 CHECK_TORQUE = f"check sign, unit and gear ratio of that torque{THEN_DIAGNOSE}"
+OR_WEAK = f"where the motion was small, move faster and further; else {CHECK_TORQUE}"
 CHECK_ROWS = f"check geometry, clocks and stated noise of the sensors in these rows{THEN_DIAGNOSE}"
 CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
@@ -111,23 +108,21 @@ def unexplained_torques(residual: Residuals) -> list[Reason]:
     shares = {name: share for name, rows in residual.items() if (share := rows.relative) is not None}
     out = []
     for name, share in sorted(shares.items(), key=lambda item: -item[1]):
-        if share > LARGEST_RESIDUAL and not noise_alone(residual[name]):
-            percent = f"{100.0 * share:.0f} % of the torque or force of {name} is not explained"
+        if residual[name].unexplained:
+            # A fit that leaves more than there is explains nothing.
+            much = f"{100.0 * min(1.0, share):.0f} %"
+            percent = f"{much} of the torque or force of {name} is not explained"
             means = "the model lacks an effect there, and the parameters are biased by its absence"
-            mark = f"{100.0 * share:.0f} % unexplained"
-            out.append(Reason(percent, True, (name,), mark, f"{percent}: {means}", CHECK_TORQUE))
+            mark = f"{much} unexplained"
+            then = CHECK_TORQUE if share < 1.0 else OR_WEAK
+            out.append(Reason(percent, True, (name,), mark, f"{percent}: {means}", then))
     return out
-
-
-def noise_alone(rows: Residual) -> bool:
-    """Whether rows hold no more than their sensors' noise."""
-    return rows.whitened is not None and rows.whitened <= NOISE_WHITENED
 
 
 def weak_torques(residual: Residuals) -> list[Reason]:
     """Torques that are little more than their noise: the motion is too weak, and nothing is known to be missing."""
     shares = {name: rows.relative for name, rows in residual.items() if rows.relative is not None}
-    weak = {name: share for name, share in shares.items() if share > LARGEST_RESIDUAL and noise_alone(residual[name])}
+    weak = {name: share for name, share in shares.items() if share > LARGEST_RESIDUAL and residual[name].noise_alone}
     if not weak:
         return []
     most = max(weak, key=lambda name: weak[name])

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sms_online.row_types import Residuals
-from sms_online.verdict.reasons import IF_NOTHING, NOISE_RESIDUAL, NOISE_WHITENED, listed
+from sms_online.row_types import NOISE_WHITENED, Residuals
+from sms_online.verdict.reasons import IF_NOTHING, NOISE_RESIDUAL, listed
 from sms_online.verdict.trust import Reason
 
 # Digits of a noise to be stated.

@@ -13,9 +13,10 @@ import rerun.blueprint as rrb
 from sms_online.evaluation import identifiable
 from sms_online.pipeline.statistics import Statistics
 from sms_online.result import event_document
+from sms_online.row_types import LARGEST_RESIDUAL
 from sms_online.stream import Array, Mask
 from sms_online.verdict.judged import JudgedEvaluation
-from sms_online.verdict.reasons import LARGEST_RESIDUAL, LARGEST_WHITENED
+from sms_online.verdict.reasons import LARGEST_WHITENED
 from sms_online.verdict.trust import Trust
 from sms_tools.report import event_line
 from sms_tools.view import style

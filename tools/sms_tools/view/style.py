@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.row_types import LARGEST_RESIDUAL
 from sms_online.stream import Array
-from sms_online.verdict.reasons import LARGEST_RESIDUAL
 from sms_online.verdict.trust import Trust
 
 Color = tuple[int, int, int]
