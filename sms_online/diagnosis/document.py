@@ -45,7 +45,7 @@ def diagnosis_document(
     before, after = diagnosis.before, diagnosis.after
     sessions = {"before": evaluated(diagnosis.estimator_before), "after": evaluated(diagnosis.estimator_after)}
     results = {name: result_of(session, truth).document() for name, session in sessions.items()}
-    unexplained, given = diagnosis.unexplained, _from_rows(diagnosis)
+    unexplained, given = diagnosis.unexplained, diagnosis.by_rows
     return {
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
@@ -111,15 +111,10 @@ def diagnosis_document(
     }
 
 
-def _from_rows(diagnosis: Search) -> bool:
-    """Whether parameters come from the rows of the diagnosis, not from a session."""
-    return diagnosis.attempt.by_rows or diagnosis.partial
-
-
 def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
     """May the parameters after be trusted? What to do next is no diagnosis: this is one."""
     trust = session.trust
-    if _from_rows(diagnosis):
+    if diagnosis.by_rows:
         # Parameters come from the rows of the diagnosis then, see `posterior`.
         known = [p.determined for p in posterior(diagnosis.attempt, diagnosis.chosen)]
         trust = judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))

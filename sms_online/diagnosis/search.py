@@ -57,6 +57,14 @@ class Search:
         """Share of what was beyond noise that is left with what was found."""
         return share_left(self.before.excess, self.after.excess)
 
+    @property
+    def by_rows(self) -> bool:
+        """Whether parameters after are those of the diagnosis's rows, and not of a session; see `Attempt.by_rows`.
+
+        Where nothing was found those of the session as described are, which knows more of its sensors' noise.
+        """
+        return (self.partial or self.attempt.by_rows) and self.after.system != self.estimator_before.system
+
     @cached_property
     def model(self) -> Model:
         """Of the system with what was found, whether or not there was a session of it."""

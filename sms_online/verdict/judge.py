@@ -23,7 +23,7 @@ def judge(evidence: Evidence) -> Trust:
     What has been shown to be wrong counts from when it is shown. Residuals of an estimate that has not converged show
     nothing: it was made of other, poorer rows.
     """
-    if reasons.lacking(evidence.discrepancies):
+    if reasons.lacking(evidence.discrepancies) or reasons.unexplained_torques(evidence.residual):
         # What the model lacks looks like errors of calibration as well.
         evidence = replace(evidence, miscalibrated=())
     alarmed = _alarmed(evidence)

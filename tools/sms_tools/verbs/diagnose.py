@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     if document["effects"]:
         lines += [_effects(document), "", *filter(None, map(why, document["effects"])), ""]
     # See `diagnosis_document`.
-    origin = "from the rows of the diagnosis" if found.search.attempt.by_rows else "by a replay with it"
+    origin = "from the rows of the diagnosis" if found.search.by_rows else "by a replay with it"
     title = f"parameters with what was found, {origin}"
     lines += [_residuals(document), "", parameter_table(document["after"], console.width, title=title), ""]
     lines += [f"warning: {warning}" for warning in document["warnings"]]
@@ -107,7 +107,7 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     estimates: dict[str, tuple[float, float]] = {}
     if (known := found.search.attempt.case.prior(estimator)) is not None:
         estimator.set_prior(known)
-    if found.search.attempt.by_rows:
+    if found.search.by_rows:
         # These come from the diagnosis's rows, not from a session; see `diagnosis_document`.
         estimates = {p.name: (p.value, p.std) for p in found.after.parameters.values()}
     with (
