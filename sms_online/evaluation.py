@@ -148,7 +148,7 @@ class Evaluation:
     def _determined(self, estimate: Estimate, std: Array) -> Mask:
         """See `determined`; of any tracker's estimate."""
         out, prior = identifiable(estimate.pi, std), self.statistics.setup.current_prior
-        if self._explains_nothing:
+        if self.explains_nothing:
             return np.zeros_like(out)
         # What an earlier run has measured, with its correlation, are data too.
         if prior is None or prior.correlation is not None:
@@ -156,7 +156,7 @@ class Evaluation:
         return out & identifiable(*beside_prior(estimate, std, prior))
 
     @property
-    def _explains_nothing(self) -> bool:
+    def explains_nothing(self) -> bool:
         """Whether the estimate leaves most of every joint's torque: it is far from any that the error bars know of."""
         joints = [each for each in self.residuals.values() if each.relative is not None]
         return bool(joints) and all(each.unexplained for each in joints)

@@ -22,6 +22,7 @@ from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.sample_faults import PIECE, StuckGuard, unit_of_stamps
 from sms_online.stream import Array, Block
 from sms_online.tables import Tabled, html_table, text_table
+from sms_online.verdict.judged import evaluated
 from sms_online.verdict.sample_reasons import MANY_OUTLIERS
 
 SCHEMA = "sms-online/check/1"
@@ -32,6 +33,10 @@ SIGN_UNKNOWN = 100.0
 GROUPS = ((1.0, "within 1 %"), (10.0, "within 10 %"), (SIGN_UNKNOWN, "within 100 %"), (math.inf, "sign unknown"))
 # What is the matter is said once so much of a session is there, s.
 SOON = 5.0
+NOT_EXPLAINED = (
+    "the description explains less than half of every torque: where the motion was small, move faster and further; "
+    "else run `sms-online diagnose`"
+)
 # Channels that one line names.
 SHOWN = 4
 
@@ -256,11 +261,14 @@ def check(system: Given, data: Data) -> Check:
     outliers.push(np.empty(0), np.empty((0, len(source.channels))), last=True)
     remarks += checks.remarks()
     remarks += [Remark("", warning, False) for warning in source.warnings]
-    determined = {} if estimator is None else _determined(estimator)
+    determined, explained = ({}, True) if estimator is None else _determined(estimator)
     remarks += _outlier_remarks({} if estimator is None else estimator.outliers, True)
     remarks += _outlier_remarks(outliers.found(source.channels), False)
     if estimator is not None and not any(share < SIGN_UNKNOWN for share in determined.values()):
         remarks.append(Remark("", "the motion determines no parameter", True))
+    elif not explained:
+        determined = {}
+        remarks.append(Remark("", NOT_EXPLAINED, True))
     channels = {
         each.name: CheckedChannel(
             each.name,
@@ -283,11 +291,14 @@ def _outlier_remarks(outliers: Mapping[str, LeftOut], left_out: bool) -> Iterato
         yield Remark(channel, f"{found.number} {what}, the first at {found.first:.3f} s", many)
 
 
-def _determined(estimator: Estimator) -> dict[str, float]:
-    """Standard deviation of each parameter relative to its size, %; inf where it is not determined."""
+def _determined(estimator: Estimator) -> tuple[dict[str, float], bool]:
+    """Standard deviation of each parameter relative to its size, %; and whether they explain any torque.
+
+    inf where it is not determined.
+    """
     estimator.finish()
     estimate = estimator.estimate()
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(estimate.determined, 100.0 * estimate.std / np.abs(estimate.pi), np.inf)
     names = [parameter.name for parameter in estimator.base.parameters]
-    return dict(zip(names, share.tolist(), strict=True))
+    return dict(zip(names, share.tolist(), strict=True)), not evaluated(estimator).explains_nothing

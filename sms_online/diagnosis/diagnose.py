@@ -154,7 +154,8 @@ def diagnose(
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
-    if said == "unexplained" and estimator_after is not before and at_noise(evaluated(estimator_after).trust):
+    noisy = said == "unexplained" and at_noise(evaluated(estimator_after).trust)
+    if noisy and estimator_after is not before:
         # What is left beside the effects does not last.
         said = "named"
     # With what was found constant parameters explain the capture, though its session may take what a law is inexact by
@@ -163,8 +164,8 @@ def diagnose(
         _check_unchanged(before, source)
     grave = said == "clean" and evaluated(before).trust.grave
     # What is left unexplained takes such numbers anywhere.
-    calibration = () if said == "unexplained" else _miscalibrated(estimator_after)
-    if said == "clean" and (mistakes or calibration):
+    calibration = () if said == "unexplained" and not noisy else _miscalibrated(estimator_after)
+    if (said == "clean" and (mistakes or calibration)) or (noisy and calibration):
         said = "named"
     unexplained = None
     if grave:
