@@ -164,7 +164,7 @@ def diagnose(
         _check_unchanged(before, source)
     grave = said == "clean" and evaluated(before).trust.grave
     # What is left unexplained takes such numbers anywhere.
-    calibration = () if said == "unexplained" and not noisy else _miscalibrated(estimator_after)
+    calibration = () if said == "unexplained" and not noisy else _miscalibrated(estimator_after, noisy and not named)
     if (said == "clean" and (mistakes or calibration)) or (noisy and calibration):
         said = "named"
     unexplained = None
@@ -247,10 +247,10 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
     )
 
 
-def _miscalibrated(session: Estimator) -> tuple[Calibration, ...]:
-    """Errors of a session's description beyond its tolerances that no effect of the catalogue covers."""
-    every = evaluated(session).calibration
-    return tuple(each for each in every if each.beyond and each.name not in covered(session.system))
+def _miscalibrated(session: Estimator, every: bool) -> tuple[Calibration, ...]:
+    """Errors of a session's description beyond its tolerances that no effect of the catalogue covers, or every such."""
+    known = () if every else covered(session.system)
+    return tuple(each for each in evaluated(session).calibration if each.beyond and each.name not in known)
 
 
 def _check_balanced(session: Estimator, source: str) -> None:

@@ -19,7 +19,7 @@ from sms_online.result import residual_document, result_of
 from sms_online.row_types import Residual
 from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
-from sms_online.verdict.judge import judge, judge_diagnosis
+from sms_online.verdict.judge import at_noise, judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
 from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, THEN_DIAGNOSE, undecided
 from sms_online.verdict.trust import Reason, Trust
@@ -198,6 +198,8 @@ def _of_effects(diagnosis: Search) -> str:
     falls = f"the residual of {row} falls {fall} on held-out data"
     if diagnosis.verdict == "named":
         return f"The model lacks {', '.join(keys)}: with {'them' if len(keys) > 1 else 'it'} {falls}."
+    if not keys and at_noise(_after(diagnosis, evaluated(diagnosis.estimator_after))):
+        return "No known effect explains what is left, which does not last: noise of torques, or a fast force."
     unexplained = diagnosis.unexplained
     assert unexplained is not None
     rest = f"acts on {unexplained.row} (seen in {unexplained.speed}) and depends on {unexplained.variable}"
