@@ -170,9 +170,6 @@ class Scale:
     def near(self, white: Array) -> tuple[Array, Array]:
         """Rows (n, n) and right-hand side that keep what columns (M, n) hardly determine near what is expected."""
         lengths = NEAR * np.linalg.norm(white, axis=0)
-        # No closer than within their own size: what is described may be far off.
-        size = np.abs(self.expected)
-        lengths = np.minimum(lengths, np.divide(1.0, size, out=lengths.copy(), where=size > 0.0))
         value = lengths * self.expected
         if self.exceeds:
             return np.diag(lengths), value
