@@ -102,7 +102,8 @@ def test_a_described_lag_leaves_the_spring_beside_a_torque_that_wanders() -> Non
     found = sms.diagnose(system, sms.Capture(block.t, block.channels, block.values))
     assert found.verdict == "unexplained"
     spring = found.after.parameters["joint_1.stiffness"]
-    assert abs(spring.value - K) < 3.0 * spring.std < 0.03 * K
+    # The session's, whose deviations are those between blocks.
+    assert abs(spring.value - K) < 3.0 * spring.std < 0.05 * K
 
 
 @pytest.mark.slow

@@ -23,6 +23,9 @@ from sms_online.trackers.interface import Prior, prior_factor
 LARGEST_RATIO = 1.5
 # With variance that is yet to be added they clearly do where so many times as much would be left.
 CLEARLY = 4.0
+# Where they do not, and this share of what is beyond noise without the candidates is left with all of them, what is
+# left is that weights are of parameters without them.
+ROUGHLY = 0.03
 # Rows for a column at least, for curves to be fitted together.
 LEAST_ROWS = 4
 # Times at most that rows are whitened anew for a set of effects: weights follow coefficients, and these the weights.
@@ -261,9 +264,13 @@ class CandidateRows(CandidateFits):
         beyond = ratio > LARGEST_RATIO
         if beyond.any() and self._scale.unknown:
             # All candidates mimic the model's terms, which then say nothing of a scale; those found so far do not.
-            solution, ratio, sized = self._beside_fit(self._beside, self.std)
-            self._scale.at = solution[: self.n_model]
-            beyond = sized > LARGEST_RATIO
+            beside, left, sized = self._beside_fit(self._beside, self.std)
+            if not np.any(beyond & ~self._scale.homogeneous) and _explained(ratio, left):
+                # Torques at noise fix the scale.
+                beyond = np.zeros_like(beyond)
+            else:
+                solution, ratio, beyond = beside, left, sized > LARGEST_RATIO
+                self._scale.at = solution[: self.n_model]
         lacking = np.maximum(0.0, (ratio - 1.0) * np.mean(self.std**2, axis=0))
         self._homogeneous = beyond & self._scale.homogeneous
         # Beside torques that leave more than noise their scale is as weak, and that of their noise draws it.
@@ -306,3 +313,12 @@ class CandidateRows(CandidateFits):
         self._plain[k] = candidate.columns / self.std[..., None]
         self._Z[k] = self._whitened(candidate.columns)
         self._forget()
+
+
+def _explained(left: Array, before: Array) -> bool:
+    """Whether mean squares of rows (n_v,) left by all candidates are noise, for all that rough weights say.
+
+    before (n_v,): left by those chosen alone.
+    """
+    excess, whole = (float(np.sum(np.maximum(0.0, each - 1.0))) for each in (left, before))
+    return bool(np.all(left <= CLEARLY * LARGEST_RATIO)) and excess < ROUGHLY * whole
