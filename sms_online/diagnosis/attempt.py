@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.candidate import Candidate
 from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.constants import corrected, is_constant
-from sms_online.diagnosis.evidence import together
 from sms_online.diagnosis.folds import Folds
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT, REWEIGHED, Hypothesis
@@ -22,11 +20,10 @@ from sms_online.diagnosis.record import LONGEST, Segment, bounded, excerpts
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.scale_free import NEAR
+from sms_online.diagnosis.start_weights import first_weights, reweight, same_weights
 from sms_online.effects.build import build_model, declaring, with_effects, with_kinematics
 from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import noise_gains
-from sms_online.pipeline.description import LOOSE, described
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.pipeline.second_order import SecondOrderNoise
@@ -36,15 +33,6 @@ from sms_online.trackers.interface import Prior
 
 # Part of a session that decides which kinematics of links are nearer, and improves channels' constants, s.
 SOME = 8.0
-# Times that all candidates are fitted together for the first weights of the rows: without weights, then with those.
-STARTS = 2
-# Rows for a column at least, for all candidates to be fitted together.
-LEAST_ROWS = 4
-# Parameters with which a coordinate's rows without a torque are smaller than this share of what the described values
-# make of them, or as much larger, give no weights: rows that hold more than noise have drawn them there.
-SHRUNK = 0.1
-# Weights are the same where the size of the rows' terms changes by less than this share.
-SAME_WEIGHTS = 0.1
 
 
 @dataclass(frozen=True)
@@ -132,85 +120,6 @@ def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
     return replace(case.noise, grid=grid, coordinates=coordinates)
 
 
-def _start(rows: SessionRows, candidates: Sequence[Candidate], prior: Prior | None, estimated: Array | None) -> None:
-    """Whiten the rows with parameters of the model alone where it explains them, else of a joint fit with candidates.
-
-    estimated (n,): of the session of this model, where it has them: noise has attenuated them less than a first fit.
-    Weights of a model that lacks a large force are no start: most rows are homogeneous in π, and where it cannot
-    explain them it shrinks π, with π their noise, and with that their weight grows without end. Beside all candidates
-    π shrinks as well where rows are noisy, and what is noise exceeds the noise of that π.
-    """
-    if estimated is not None:
-        rows.reweight(estimated)
-        if _at_noise(rows):
-            return
-    _weigh(rows, rows.Y, prior)
-    if _at_noise(rows):
-        return
-    columns = np.concatenate([rows.Y, *(candidate.columns for candidate in candidates)], axis=2)
-    if candidates and LEAST_ROWS * columns.shape[2] <= rows.b.size:
-        _weigh(rows, columns, prior)
-
-
-def _at_noise(rows: SessionRows) -> bool:
-    """Whether the parameters that rows are whitened with leave no more than noise."""
-    left = (rows.b - rows.Y @ rows.beta) / rows.std
-    return not any(row.beyond for row in ResidualTest(rows).of(left).values())
-
-
-def _weigh(rows: SessionRows, columns: Array, prior: Prior | None) -> None:
-    """Whiten the rows with parameters of a fit of columns to them, or with the described ones where these cannot be.
-
-    Parameters that the prior keeps would hide that the rows have drawn the others to zero.
-    """
-    value, size = described(rows.model, rows.base)
-    std = np.ones_like(rows.b)
-    for _ in range(STARTS):
-        alone, beta = _beside_candidates(columns / std[..., None], rows.b / std, prior, value, size)
-        rows.reweight(beta)
-        std = rows.std
-    if not (_likely(rows, alone) and _likely(rows, beta)):
-        rows.reweight(value)
-
-
-def _beside_candidates(columns: Array, b: Array, prior: Prior | None, value: Array, size: Array) -> tuple[Array, Array]:
-    """Parameters (n,) of a joint fit of columns (W, n_v, n + c) to b (W, n_v), by the rows alone and as weights.
-
-    A candidate may act as a parameter does: friction by direction as viscous friction. Their coefficients then cancel
-    each other at any size, but noise is propagated by the parameters alone. So weights have the loose prior of those of
-    a session (`pipeline.description`): value (n,), of deviation size, beside rows that are uncertain by what the fit
-    leaves. What has no size, as an effect that is described without coefficients, stays near its value where the rows
-    hardly determine it.
-    """
-    n = value.size
-    R = np.asarray(np.linalg.qr(np.column_stack((columns.reshape(b.size, -1), b.ravel())), mode="r"))
-    left = abs(float(R[-1, -1])) / np.sqrt(b.size)
-    loose = np.divide(left, LOOSE * size, out=np.zeros(n), where=size > 0.0)
-    lengths = np.hypot(loose, NEAR * np.linalg.norm(R[:, :n], axis=0))
-    known = np.zeros((n, R.shape[1]))
-    known[:, :n], known[:, -1] = np.diag(lengths), lengths * value
-    alone, beta = (together(each[:, None, :-1], each[:, -1:], prior)[:n] for each in (R, np.concatenate((R, known))))
-    return alone, beta
-
-
-def _reweight(rows: SessionRows, beta: Array) -> None:
-    """Whiten the rows with parameters beta (n,), or with the described ones where these cannot be."""
-    rows.reweight(beta if _likely(rows, beta) else rows.base.values(rows.model.nominal))
-
-
-def _likely(rows: SessionRows, beta: Array) -> bool:
-    """Whether rows without a torque have not drawn parameters beta (n,) to another scale."""
-    sizes, expected = (
-        _sizes(rows, each)[~np.any(rows.b, axis=0)] for each in (beta, rows.base.values(rows.model.nominal))
-    )
-    return bool(np.all((expected == 0.0) | ((sizes >= SHRUNK * expected) & (SHRUNK * sizes <= expected))))
-
-
-def _sizes(rows: SessionRows, beta: Array) -> Array:
-    """Size (n_v,) of the terms of each speed's rows with parameters beta (n,)."""
-    return np.asarray(np.linalg.norm(rows.Y * beta, axis=(0, 2)))
-
-
 class Attempt(Hypothesis):
     """One description of the system against the samples of a whole capture."""
 
@@ -264,9 +173,9 @@ class Attempt(Hypothesis):
         made = make.seen(forces) if candidates is None else [make.of(effect) for effect in forces]
         if beta is None:
             laws = [candidate for candidate in made if not candidate.traits.learned]
-            _start(rows, laws, prior, session.estimate().pi if same else None)
+            first_weights(rows, laws, prior, session.estimate().pi if same else None)
         else:
-            _reweight(rows, beta)
+            reweight(rows, beta)
         self._most_found = 0
         super().__init__(make, [*make.seen(self._lasting), *made], folds, prior, constants)
 
@@ -309,7 +218,7 @@ class Attempt(Hypothesis):
             if self.prior is not None:
                 beta = np.where(self.prior.known, self.prior.value, beta)
             # Rows that leave more than noise whatever is added are weighted by that.
-            if self.tracing.freed or self._same_weights(beta):
+            if self.tracing.freed or same_weights(self.rows, beta):
                 break
             if self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break
@@ -319,11 +228,6 @@ class Attempt(Hypothesis):
             self.trace([*self.make.seen(self._lasting), *forces])
             chosen = self.run(begun)
         return chosen
-
-    def _same_weights(self, beta: Array) -> bool:
-        """Whether beta (n,) would give the same weights: the rows' noise goes with the size of their terms."""
-        sizes = [_sizes(self.rows, values) for values in (beta, self.rows.beta)]
-        return bool(np.all(np.abs(sizes[0] - sizes[1]) <= SAME_WEIGHTS * sizes[1]))
 
     def conclude(self, chosen: Sequence[int]) -> None:
         """Improve the constants by all the rows, once more: they were found on stretches.
