@@ -167,6 +167,28 @@ def test_stiction_is_found_beside_columns_that_fit_it_better(ripples: bool) -> N
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_a_slow_force_is_found_in_rows_whose_noise_is_fast(seed: int) -> None:
+    """Noise of neighbouring rows nearly cancels: of their variance the force makes 4 %, and of whitened rows most."""
+    rng = np.random.default_rng(seed)
+    x, y, torque_noise = rng.standard_normal((3, WINDOWS))
+    white, size = rng.standard_normal(WINDOWS + 1), np.sqrt(1.0 + 0.95**2)
+    noise = (white[1:] - 0.95 * white[:-1]) / size
+    slow = np.sin(np.arange(WINDOWS) / 15.0)
+    true = np.array([1.0, 1.0])
+    Y = np.stack((50.0 * np.stack((x, y), axis=1), 50.0 * np.stack((x, -x), axis=1)), axis=1)
+    Y[:, 1, 0] += noise - 0.3 * slow
+    b = np.zeros((WINDOWS, SPEEDS))
+    b[:, 0] = Y[:, 0] @ true + torque_noise
+    drag, other = _candidate("air_drag", np.zeros(WINDOWS)), _candidate("cogging", rng.standard_normal(WINDOWS))
+    drag.columns[:, 1, 0] = slow
+    rows = WeakRows(Y, b, 1000.0)
+    own, before = np.eye(SPEEDS), np.diag([0.0, -0.95 / size**2])
+    rows.have_noise([[own], *([[before, own]] * (WINDOWS - 1))])
+    rows.weights = true
+    assert Tracing(rows, [drag, other], FOLDS).run(lambda chosen, k: None) == [0]
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_a_weak_torque_does_not_shrink_parameters(seed: int) -> None:
     """A torque of which most is unknown gives the scale alone: without the spring's law all else would vanish."""
     rng = np.random.default_rng(seed)
