@@ -57,7 +57,7 @@ def coarse(step: float, block: Block, coefficients: bool = True) -> tuple[System
 @pytest.mark.slow
 def test_what_effects_leave_does_not_depend_on_questions_before() -> None:
     bench = attempt()
-    assert bench.tracing.freed
+    assert bench.tracing.exceeds
     sets = [[], [0], [1], [0, 1]]
     first = {tuple(chosen): bench.state(chosen) for chosen in sets}
     for chosen in (*reversed(sets), *sets[1:]):

@@ -297,8 +297,9 @@ def _determined(estimator: Estimator) -> tuple[dict[str, float], bool]:
     inf where it is not determined.
     """
     estimator.finish()
-    estimate = estimator.estimate()
+    now = evaluated(estimator)
+    estimate = now.estimate
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(estimate.determined, 100.0 * estimate.std / np.abs(estimate.pi), np.inf)
     names = [parameter.name for parameter in estimator.base.parameters]
-    return dict(zip(names, share.tolist(), strict=True)), not evaluated(estimator).explains_nothing
+    return dict(zip(names, share.tolist(), strict=True)), not now.explains_nothing

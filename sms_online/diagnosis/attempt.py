@@ -196,7 +196,7 @@ class Attempt(Hypothesis):
         So they are with a prior that these heed; without any prior, where rows without a torque leave more than noise:
         nothing says then at which scale a session ends.
         """
-        return self.prior is not None or (self.tracing.freed and self._known is None)
+        return self.prior is not None or (self.tracing.exceeds and self._known is None)
 
     def watch(self, chosen: Sequence[int]) -> bool:
         """See `Hypothesis`."""
@@ -218,7 +218,7 @@ class Attempt(Hypothesis):
             if self.prior is not None:
                 beta = np.where(self.prior.known, self.prior.value, beta)
             # Rows that leave more than noise whatever is added are weighted by that.
-            if self.tracing.freed or same_weights(self.rows, beta):
+            if self.tracing.exceeds or same_weights(self.rows, beta):
                 break
             if self.excess(chosen) > LARGEST_SHARE_LEFT * self.excess([]):
                 break

@@ -165,7 +165,7 @@ class CandidateRows(CandidateFits):
             return False
         own, free = self._unmodelled(self._laws, chosen)
         std = np.sqrt(self.rows.std**2 + own + free[:, 0])
-        squares = self._beside_fit(chosen, std)[2] if self.freed else np.mean(self._together(std)[1] ** 2, axis=0)
+        squares = self._beside_fit(chosen, std)[2] if self.exceeds else np.mean(self._together(std)[1] ** 2, axis=0)
         return bool(np.any(squares[acts] > CLEARLY * LARGEST_RATIO))
 
     def _whiten(self) -> None:
@@ -265,7 +265,7 @@ class CandidateRows(CandidateFits):
         if beyond.any() and self._scale.unknown:
             # All candidates mimic the model's terms, which then say nothing of a scale; those found so far do not.
             beside, left, sized = self._beside_fit(self._beside, self.std)
-            if not np.any(beyond & ~self._scale.homogeneous) and _explained(ratio, left):
+            if not np.any(beyond & ~self._scale.homogeneous) and _only_rough_weights(ratio, left):
                 # Torques at noise fix the scale.
                 beyond = np.zeros_like(beyond)
             else:
@@ -302,8 +302,8 @@ class CandidateRows(CandidateFits):
         return solution, b - columns @ solution
 
     @property
-    def freed(self) -> bool:
-        """Whether rows without a torque leave more than noise whatever is added, and count by their size."""
+    def exceeds(self) -> bool:
+        """Whether rows leave more than noise whatever is added, so that those without a torque count by their size."""
         return self._scale.exceeds
 
     def put(self, k: int, candidate: Candidate) -> None:
@@ -315,8 +315,8 @@ class CandidateRows(CandidateFits):
         self._forget()
 
 
-def _explained(left: Array, before: Array) -> bool:
-    """Whether mean squares of rows (n_v,) left by all candidates are noise, for all that rough weights say.
+def _only_rough_weights(left: Array, before: Array) -> bool:
+    """Whether rough weights alone may be why all candidates leave mean squares of rows (n_v,) beyond noise.
 
     before (n_v,): left by those chosen alone.
     """

@@ -36,7 +36,7 @@ from sms_online.stream import Block
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Drift
 from sms_online.verdict.judge import at_noise
-from sms_online.verdict.judged import evaluated
+from sms_online.verdict.judged import JudgedEvaluation, evaluated
 
 
 @one_blas_thread()
@@ -98,7 +98,7 @@ def diagnose(
     if drifts:
         return _drifting(case, followed, drifts, mistakes)
     late: list[LateSensor] = []
-    while (_explains_little(before) or attempt.tracing.freed) and (found := find_late(attempt.rows)):
+    while (_explains_little(before) or attempt.tracing.exceeds) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         attempt = Attempt(case, declaring(attempt.system, [found.effect]))
@@ -154,7 +154,8 @@ def diagnose(
     said = verdict(
         named, share_left(bare.excess, after.excess), after.test, bare.test, [each.candidate for each in findings]
     )
-    noisy = said == "unexplained" and at_noise(evaluated(estimator_after).trust)
+    now = evaluated(estimator_after)
+    noisy = said == "unexplained" and at_noise(now.trust)
     if noisy and estimator_after is not before:
         # What is left beside the effects does not last.
         said = "named"
@@ -162,9 +163,9 @@ def diagnose(
     # for a change. What a change does not explain may only look like one.
     if not partial and said != "named" and not leaves_unexplained(before):
         _check_unchanged(before, source)
-    grave = said == "clean" and evaluated(before).trust.grave
+    grave = said == "clean" and now.trust.grave
     # What is left unexplained takes such numbers anywhere.
-    calibration = () if said == "unexplained" and not noisy else _miscalibrated(estimator_after, noisy and not named)
+    calibration = () if said == "unexplained" and not noisy else _miscalibrated(now, noisy and not named)
     if (said == "clean" and (mistakes or calibration)) or (noisy and calibration):
         said = "named"
     unexplained = None
@@ -201,7 +202,7 @@ def _first(case: Case, system: System) -> tuple[Case, Attempt]:
     """
     alone = replace(case, use_prior=False)
     attempt = Attempt(alone, system)
-    if attempt.tracing.freed or case.prior(case.session) is None:
+    if attempt.tracing.exceeds or case.prior(case.session) is None:
         return alone, attempt
     return case, Attempt(case, system)
 
@@ -247,10 +248,10 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
     )
 
 
-def _miscalibrated(session: Estimator, every: bool) -> tuple[Calibration, ...]:
+def _miscalibrated(session: JudgedEvaluation, every: bool) -> tuple[Calibration, ...]:
     """Errors of a session's description beyond its tolerances that no effect of the catalogue covers, or every such."""
-    known = () if every else covered(session.system)
-    return tuple(each for each in evaluated(session).calibration if each.beyond and each.name not in known)
+    known = () if every else covered(session.statistics.setup.system)
+    return tuple(each for each in session.calibration if each.beyond and each.name not in known)
 
 
 def _check_balanced(session: Estimator, source: str) -> None:

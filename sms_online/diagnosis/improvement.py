@@ -102,7 +102,7 @@ def explaining_alone(case: Case, system: System, attempt: Attempt, chosen: Seque
     Few windows do not distinguish a lag from what was not yet in the model when it was looked for.
     """
     forces = [attempt.tracing.candidates[k].effect for k in chosen]
-    if not forces or attempt.tracing.freed:
+    if not forces or attempt.tracing.exceeds:
         return []
     alone = Attempt(case, system, candidates=forces)
     beyond = any(row.beyond for row in alone.test(range(len(alone.tracing.candidates))).values())
@@ -115,7 +115,7 @@ def no_joint_worse(attempt: Attempt, chosen: list[int]) -> list[int]:
 
     All of those chosen where rows leave no more than noise: by that torques differ.
     """
-    if not attempt.tracing.freed:
+    if not attempt.tracing.exceeds:
         return chosen
     before = attempt.state([]).holdout.relative
     for step in (chosen, *(step for _, step in reversed(attempt.tracing.path) if step != chosen)):
