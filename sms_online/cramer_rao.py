@@ -64,7 +64,7 @@ class MotionRecord(Observer):
         self._every = max(1, round(STEP * sample_rate))
         self._segments: dict[int, list[Motion]] = {}
 
-    def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array) -> None:
+    def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array, states: Array) -> None:
         """See `Observer`."""
         kept = index % self._every == 0
         piece = Motion(index[kept] / self._sample_rate, x[kept], v[kept], inputs[kept])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from sms_online.description.schema import System
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import SampleRecord, bounded, excerpts
-from sms_online.diagnosis.residuals import ResidualTest, RowResidual
+from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.relinearisation import NOISE_RENEWED, PASS_BAND
@@ -18,6 +19,17 @@ from sms_online.pipeline.sensing import is_slow, stated_period
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.torque_gains import GAIN
 from sms_online.stream import Array, Block
+
+# Ends of the names of the parameters whose forces grow with a deflection.
+ELASTIC = ("stiffness", "rigidity", "rigidity_y", "rigidity_z")
+
+
+@dataclass(frozen=True)
+class TypeResidual:
+    """What is left of one row type. rows: over its noise. elastic: as a share of elastic forces, None without any."""
+
+    rows: RowResidual
+    elastic: float | None
 
 
 class FixedResidual:
@@ -51,12 +63,12 @@ class FixedResidual:
             self._renewed = float(block.t[-1])
             self._noise = self._estimate.noise(self._session.periods, self._system)
 
-    def by_type(self, beta: Array, gains: Mapping[str, float]) -> dict[str, RowResidual]:
-        """Residuals of parameters β (n,) by row type; empty where there are too few samples, or noise has no effect.
+    def by_type(self, beta: Array, gains: Mapping[str, float]) -> dict[str, TypeResidual]:
+        """What parameters β (n,) leave by row type; empty where there are too few samples, or noise has no effect.
 
         gains: share by which joints' torques are read too large, by name.
         """
-        noise, sensing = self._noise, self._session.sensing
+        session, noise, sensing = self._session, self._noise, self._session.sensing
         length, most = bounded(self._system)
         whole = [corrected(self._system, sensing.channels, each) for each in self._record.segments()]
         least = least_samples(self._system)
@@ -64,11 +76,16 @@ class FixedResidual:
         if noise is None or noise.exact or not segments:
             return {}
         try:
-            rows = SessionRows(self._session.model, self._session.base, sensing, noise, segments, beta)
+            rows = SessionRows(session.model, session.base, sensing, noise, segments, beta)
         except np.linalg.LinAlgError:
             # Readings that no shape of the links gives.
             return {}
         nuisances = rows.calibrated.nuisances
         held = np.array([gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in nuisances])
         residual = rows.Y @ beta + rows.calibrated.columns @ held - rows.b
-        return ResidualTest(rows).of(residual / rows.std)
+        elastic = [k for k, each in enumerate(session.base.parameters) if each.name.endswith(ELASTIC)]
+        force = whitened(rows, rows.Y[..., elastic] @ beta[elastic] / rows.std)
+        return {
+            name: TypeResidual(each, each.whitened / force[name] if force[name] > 0.0 else None)
+            for name, each in ResidualTest(rows).of(residual / rows.std).items()
+        }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -14,22 +14,21 @@ from sms_online.cramer_rao import MotionRecord
 from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.schema import System
-from sms_online.diagnosis.evidence import RANK_TOLERANCE
 from sms_online.diagnosis.residuals import RowResidual
 from sms_online.errors import InputError
 from sms_online.evaluation import negative
-from sms_online.fixed_residual import FixedResidual
+from sms_online.fixed_residual import FixedResidual, TypeResidual
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.physical import PhysicalSet
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.joint_balance import SquaredResidual
 from sms_online.pipeline.torque_gains import GAIN, gain_columns
 from sms_online.result import Parameter, Parameters, Result
-from sms_online.row_types import LARGEST_RESIDUAL, NOISE_WHITENED, joint_rows
+from sms_online.row_types import LARGEST_RESIDUAL, NOISE_WHITENED
 from sms_online.stream import Array
 from sms_online.tables import Tabled
+from sms_online.torque_prediction import TorqueCourse, TorquePrediction
 from sms_online.verdict.reasons import (
     DESCRIBE,
     DIAGNOSE,
@@ -44,24 +43,28 @@ SCHEMA = "sms-online/validation/1"
 HOLDS = 1.15
 # And less than this share of a torque is none.
 NEGLIGIBLE = 0.01
-# What validation says of parameters: they hold; they do as well as a fit to the run, which leaves a large share of a
-# torque unexplained; a torque is mostly noise, and contradicts nothing; they differ from those of the run; nothing has
-# them.
-Verdict = Literal["hold", "weak", "unexplained", "differ", "impossible"]
+# What validation says of parameters: they hold; a torque is mostly noise, and contradicts nothing; they do as well as a
+# fit to the run, which leaves a large share of a torque unexplained; they hold but for the zero of a torque; they
+# differ from those of the run; nothing has them.
+Verdict = Literal["hold", "weak", "unexplained", "shifted", "differ", "impossible"]
 
 
 @dataclass(frozen=True)
 class Predicted:
     """The prediction error of a joint's torque or force, as a share: rms over rms.
 
-    left: with everything fixed. least: with parameters fitted to this run, what the description itself lacks and noise,
-    of which a fit takes some for motion. rows: what is left of the joint's momentum rows over the sensors' noise in
-    them, None where that is not known.
+    left: with everything fixed. least: with parameters and a zero of the torque fitted to this run, what the
+    description itself lacks and noise, of which a fit takes some for motion. rows: what is left of the joint's momentum
+    rows over the sensors' noise in them, None where that is not known. zero: what the torque reads too much throughout
+    if the prediction is right, at the shaft, in `unit`; zero_share: its size over rms of the torque.
     """
 
     left: float
     least: float
     rows: RowResidual | None = None
+    zero: float = 0.0
+    zero_share: float = 0.0
+    unit: str = "N m"
 
     @property
     def ratio(self) -> float:
@@ -69,9 +72,22 @@ class Predicted:
         return self.left / self.least if self.least > 0.0 else np.inf
 
     @property
+    def beside_zero(self) -> float:
+        """The share that is left beside a zero of the torque, which each run has its own of."""
+        return float(np.sqrt(max(0.0, self.left**2 - self.zero_share**2)))
+
+    @property
     def holds(self) -> bool:
         """Whether the parameters hold for this joint: fitting them to this run would gain little, or noise alone."""
-        return self.left <= max(NEGLIGIBLE, HOLDS * self.least) or (self.rows is not None and not self.rows.beyond)
+        return self._as_fitted(self.left) or (self.rows is not None and not self.rows.beyond)
+
+    @property
+    def shifted(self) -> bool:
+        """Whether they hold but for a zero of the torque."""
+        return not self.holds and self._as_fitted(self.beside_zero)
+
+    def _as_fitted(self, left: float) -> bool:
+        return left <= max(NEGLIGIBLE, HOLDS * self.least)
 
     @property
     def weak(self) -> bool:
@@ -83,10 +99,18 @@ class Predicted:
         """Whether a large share of the torque is left that is not noise."""
         return self.left > NOISE_RESIDUAL and (self.rows is None or self.rows.whitened > NOISE_WHITENED)
 
-    def document(self) -> dict[str, float | None]:
+    def document(self) -> dict[str, float | str | None]:
         """The entry of validation.json."""
         noise = (None, None) if self.rows is None else (self.rows.whitened, self.rows.limit)
-        return {"left": self.left, "least": self.least, "whitened": noise[0], "limit": noise[1]}
+        return {
+            "left": self.left,
+            "least": self.least,
+            "zero": self.zero,
+            "unit": self.unit,
+            "beside_zero": self.beside_zero,
+            "whitened": noise[0],
+            "limit": noise[1],
+        }
 
 
 @dataclass(frozen=True, repr=False)
@@ -96,6 +120,8 @@ class Validation(Tabled):
     system: with which description. duration: of the run, s. joints: `joint_i` to what is left of its torque; those
     without a torque are left out. impossible: why nothing has the parameters, a clause each. diagnosed: whether the
     system is what a diagnosis has found. warnings: of the source, and of a motion beyond what effects are known for.
+    links: `link_i` to what is left of the elastic forces that its deflection makes; empty where shapes are not measured
+    or sensors are too slow. courses: of the joints' torques.
     """
 
     system: str
@@ -104,6 +130,8 @@ class Validation(Tabled):
     impossible: tuple[str, ...] = ()
     diagnosed: bool = False
     warnings: tuple[str, ...] = ()
+    links: Mapping[str, TypeResidual] = field(default_factory=dict)
+    courses: Mapping[str, TorqueCourse] = field(default_factory=dict)
 
     LEFT = 1
 
@@ -112,8 +140,9 @@ class Validation(Tabled):
         """What is said of the parameters; the first that applies, from the worst on."""
         if self.impossible:
             return "impossible"
-        if not all(each.holds for each in self.joints.values()):
-            return "differ"
+        differ = [each for each in self.joints.values() if not each.holds]
+        if differ:
+            return "shifted" if all(each.shifted for each in differ) else "differ"
         if any(each.unexplained for each in self.joints.values()):
             return "unexplained"
         return "weak" if any(each.weak for each in self.joints.values()) else "hold"
@@ -138,6 +167,16 @@ class Validation(Tabled):
             ratio = f"{worst.ratio:.3g} times the residual of parameters fitted to it"
             beside = "" if worst.rows is None else f" and {worst.rows.whitened:.3g} times its noise"
             return f"The parameters do not hold on this run: {left}, {ratio}{beside}."
+        if verdict == "shifted":
+            shifted = sorted((each for each in joints if each[1].shifted), key=lambda item: -item[1].zero_share)
+            zeros = listed([f"{name}'s by {each.zero:+.2g} {each.unit}" for name, each in shifted])
+            name, worst = shifted[0]
+            share = f"{100.0 * worst.zero_share:.2g} % of the torque of {name}, beside which"
+            return (
+                f"The parameters hold on this run but for the zeros of torques: {zeros} at the shaft, {share} "
+                f"{100.0 * worst.beside_zero:.2g} % is left. Zero the sensors before each run, or declare "
+                f"torque_offset@{name} and fit it."
+            )
         if verdict == "unexplained":
             name, worst = max((each for each in joints if each[1].unexplained), key=lambda item: item[1].left)
             as_well = "The parameters predict this run as well as those fitted to it"
@@ -162,6 +201,10 @@ class Validation(Tabled):
             "sentence": self.sentence,
             "impossible": list(self.impossible),
             "joints": {name: each.document() for name, each in self.joints.items()},
+            "links": {
+                name: {"left": each.elastic, "whitened": each.rows.whitened, "limit": each.rows.limit}
+                for name, each in self.links.items()
+            },
             "warnings": list(self.warnings),
         }
 
@@ -170,14 +213,19 @@ class Validation(Tabled):
         cells = [
             [
                 name,
-                f"{e.left:.3g}",
-                f"{e.least:.3g}",
-                f"{e.ratio:.2f}",
-                "" if e.rows is None else f"{e.rows.whitened:.3g}",
+                *(f"{share:.3g}" for share in (each.left, each.beside_zero, each.least)),
+                f"{each.ratio:.2f}",
+                "" if each.rows is None else f"{each.rows.whitened:.3g}",
             ]
-            for name, e in self.joints.items()
+            for name, each in self.joints.items()
         ]
-        return ["joint", "share of torque left", "fitted to this run", "ratio", "times noise"], cells
+        left = ["share of torque left", "beside its zero", "fitted to this run"]
+        return ["joint", *left, "ratio", "times noise"], cells
+
+    def link_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Headings and cells of a table of the links."""
+        cells = [[name, f"{each.elastic:.3g}", f"{each.rows.whitened:.3g}"] for name, each in self.links.items()]
+        return ["link", "share of elastic force left", "times noise"], cells
 
 
 def validate(
@@ -201,14 +249,15 @@ def validate(
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     # The rows of the joints' torques depend on no estimate; without a momentum balance no event changes the model.
     session = Estimator(system.model_copy(update={"balance": "energy"}), recorded.source.channels, recorded.name)
-    # Where shapes are not measured, no session has estimated gains.
-    sensing = None if session.sensing.missing else session.sensing
-    session.energy.begin_joints(session.model, session.base, sensing)
+    beta = _values(session.base, system, parameters)
     gains = gains or {}
-    described = () if sensing is None else nuisances(sensing)
-    held = [gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in described]
+    # Where shapes are not measured, no session has estimated gains.
+    described = () if session.sensing.missing else nuisances(session.sensing)
+    held = np.array([gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in described])
+    # A free gain would make a torque vanish.
+    prediction = TorquePrediction(session, beta, held, gain_columns(session.model, session.base, ()))
     motion = MotionRecord(system.sample_rate)
-    session.observers.append(motion)
+    session.observers += [prediction, motion]
     channels = tuple(recorded.source.channels)
     residual = FixedResidual(session, system, channels) if FixedResidual.known(session, system) else None
     for block in recorded.source:
@@ -216,20 +265,20 @@ def validate(
         if residual is not None:
             residual.push(block)
     session.finish()
-    beta = _values(session.base, system, parameters)
-    sums = {joint_rows(i): each for i, each in enumerate(session.energy.joint_residuals) if each.signal > 0.0}
-    if not sums:
+    courses, least = prediction.courses, prediction.least()
+    if not courses:
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
-    known = np.array(held)
-    fitted = _fitted(list(sums.values()), beta, known, gain_columns(session.model, session.base, ()))
-    rows = {} if residual is None else residual.by_type(beta, gains)
+    left = {} if residual is None else residual.by_type(beta, gains)
     joints = {
-        name: Predicted(_share(each, beta, known), _share(each, fitted, known), rows.get(name))
-        for name, each in sums.items()
+        name: Predicted(
+            each.left, least[name], left[name].rows if left else None, each.zero, each.zero_share, each.unit
+        )
+        for name, each in courses.items()
     }
+    links = {name: each for name, each in left.items() if name.startswith("link_") and each.elastic is not None}
     warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
     cannot = _impossible(session.model, session.base, beta, parameters)
-    return Validation(system.name, session.duration, joints, cannot, bool(system.fitted), warnings)
+    return Validation(system.name, session.duration, joints, cannot, bool(system.fitted), warnings, links, courses)
 
 
 def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
@@ -238,12 +287,6 @@ def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
         return []
     x, v = (np.concatenate([getattr(motion, part) for motion in motions]) for part in ("x", "v"))
     return [said for effect in model.effects if (said := effect.beyond(model.layout, x, v))]
-
-
-def _share(sums: SquaredResidual, beta: Array, known: Array) -> float:
-    share = sums.relative(beta, known)
-    assert share is not None
-    return share
 
 
 def _values(base: BaseParameters, system: System, parameters: Parameters | Mapping[str, float] | None) -> Array:
@@ -290,19 +333,3 @@ def _impossible(
         of = listed(nearest.active)
         out.append(f"no distribution of mass has those of {of}, by at least {distance:.0f} standard deviations")
     return tuple(out)
-
-
-def _fitted(sums: list[SquaredResidual], beta: Array, known: Array, gains: Sequence[int]) -> Array:
-    """β (n,) that leaves least of all joints' torques, each relative to its own.
-
-    known (m,): nuisances. gains: parameters that stay those of beta (n,): a free one would make a torque vanish.
-    """
-    gram = np.sum([each.gram / each.signal for each in sums], axis=0)
-    w, free = sums[0].unknowns(beta, known), np.setdiff1d(np.arange(beta.size), gains)
-    fixed = np.setdiff1d(np.arange(w.size), free)
-    size = np.sqrt(np.diag(gram))[free]
-    size[size == 0.0] = 1.0
-    scaled = gram[np.ix_(free, free)] / np.outer(size, size)
-    known_part = -gram[np.ix_(free, fixed)] @ w[fixed]
-    w[free] = np.linalg.lstsq(scaled, known_part / size, rcond=RANK_TOLERANCE)[0] / size
-    return w[: beta.size]

@@ -51,7 +51,7 @@ def record_of(exact: ExactStates, segments: Array) -> MotionRecord:
     cuts = np.unique(np.concatenate((segments, [7, 260, 1111]))).astype(int)
     for piece in np.split(index, cuts):
         segment = int(np.searchsorted(segments, piece[0], side="right"))
-        record.motion(piece, segment, exact.x[piece], exact.v[piece], exact.torque[piece])
+        record.motion(piece, segment, exact.x[piece], exact.v[piece], exact.torque[piece], np.zeros((piece.size, 0)))
     return record
 
 

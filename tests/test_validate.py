@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sms_online as sms
 from sms_online.description.parse import parse_system
 from sms_online.diagnosis.residuals import RowResidual
-from sms_online.validation import HOLDS, Predicted, Validation
+from sms_online.validation import Predicted, Validation
+from sms_online.verdict.reasons import NOISE_RESIDUAL
 from sms_tools.cli import main
 from tests.one_link import one_link
 from tests.test_compare import ELASTIC_AXIS, STIFFNESS
@@ -55,6 +58,26 @@ def test_a_stiffness_that_is_off_does_not_hold(rig: Path) -> None:
     assert not found.holds
     assert found.joints["joint_1"].left > 0.03
     assert "do not hold" in found.sentence
+    # What a spring is off by shows at the link as it is: there is no other force of that size.
+    assert found.links["link_1"].elastic == pytest.approx(0.1, abs=0.03)
+
+
+def test_a_torque_sensor_with_another_zero_is_said_with_its_size(rig: Path) -> None:
+    system = sms.load_system(rig / "rig.toml")
+    result = sms.estimate(system, rig / "monday.csv")
+    tuesday = sms.read_capture(rig / "tuesday.csv")
+    torque = tuesday.channels.index("tau_1")
+    size = np.sqrt(np.mean(tuesday.values[:, torque] ** 2))
+    values = tuesday.values.copy()
+    values[:, torque] += 0.2 * size
+    found = sms.validate(system, replace(tuesday, values=values), result)
+    assert found.verdict == "shifted"
+    assert not found.holds
+    joint = found.joints["joint_1"]
+    assert joint.zero == pytest.approx(0.2 * size, rel=0.02)
+    assert joint.left == pytest.approx(0.2, abs=0.03)
+    assert joint.beside_zero < 0.02
+    assert "joint_1's by +" in found.sentence
 
 
 @pytest.mark.slow
@@ -67,6 +90,10 @@ def test_the_verb_takes_the_folder_of_a_run(rig: Path, capsys: pytest.CaptureFix
     document = json.loads(capsys.readouterr().out)
     assert document == json.loads((out / "validation.json").read_text())
     assert document["holds"]
+    assert set(document["links"]) == {"link_1"}
+    page = (out / "validation.html").read_text()
+    assert "The parameters hold for the torques of this run" in page
+    assert page.count("<figure>") == 2
     assert document["duration_s"] == pytest.approx(5.0, abs=0.01)
     assert main(["validate", *arguments, "--system", str(rig / "rig.toml")]) == 0
     assert not json.loads(capsys.readouterr().out)["holds"]
@@ -86,12 +113,12 @@ def test_a_link_whose_shape_is_not_measured_is_predicted_as_well() -> None:
 
 
 @pytest.mark.slow
-def test_true_parameters_hold_where_a_fit_takes_noise_for_motion() -> None:
+def test_true_parameters_hold_where_a_torque_is_mostly_noise() -> None:
     """A rigid arm whose torques are little beside their noise: grade B, seed 1."""
     arm = parse_system(ARM, "arm.toml")
     found = sms.validate(arm, sms.simulate(arm, grade="B", seed=1, duration=4.0))
     noisy = found.joints["joint_1"]
-    assert noisy.ratio > HOLDS
+    assert noisy.left > NOISE_RESIDUAL
     assert noisy.rows is not None
     # Noise is predicted to a tenth, and 4 s are few windows.
     assert noisy.rows.whitened == pytest.approx(1.0, abs=0.3)
@@ -128,6 +155,8 @@ def test_an_inertia_that_no_distribution_of_mass_has_is_impossible(rig: Path) ->
         (Predicted(0.05, 0.045, MORE), "hold"),  # real rigs are never perfect
         (Predicted(0.25, 0.15, MORE), "differ"),
         (Predicted(0.25, 0.15, NOISE), "hold"),
+        (Predicted(0.25, 0.1, MORE, zero=0.4, zero_share=0.23), "shifted"),
+        (Predicted(0.25, 0.1, MORE, zero=0.4, zero_share=0.2), "differ"),
         (Predicted(0.009, 0.001, MORE), "hold"),
     ],
 )

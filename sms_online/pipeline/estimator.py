@@ -373,9 +373,10 @@ class Estimator(Stage):
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
         if self.smoother is not None:
             self.smoother.move(rates.index, x, v)
+        states = self._preparation.states(rates)
         for observer in self.observers:
-            observer.motion(rates.index, rates.segment, x, v, inputs)
-        signals = np.concatenate((inputs, self._preparation.states(rates)), axis=1)
+            observer.motion(rates.index, rates.segment, x, v, inputs, states)
+        signals = np.concatenate((inputs, states), axis=1)
         self.energy.push(
             rates.index, rates.segment, x, v, signals, self._rates.sigma[n_x:], self._synchroniser.start_time
         )

@@ -6,6 +6,8 @@ only positions and speeds appear: -∫ (φ̇ P + φ G) dt π = ∫ φ n τ dt.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import msgspec
 import numpy as np
 
@@ -85,17 +87,26 @@ class JointState(State):
 class JointBalance(Stage):
     """Turns consecutive samples into weak-form rows of every joint, in N m s (N s).
 
-    sensing: what has nuisances, where they are estimated.
+    sensing: what has nuisances, where they are estimated. gapless: windows that overlap by half.
     """
 
-    def __init__(self, model: Model, base: BaseParameters, sample_rate: float, sensing: Sensing | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        base: BaseParameters,
+        sample_rate: float,
+        sensing: Sensing | None = None,
+        gapless: bool = False,
+    ) -> None:
         self.model = model.of_parameters(base.needed)
         self.base = base
         self._sensing, self._sample_rate = sensing, sample_rate
         self._calibration = None if sensing is None else JointCalibration(sensing)
         seconds = model.system.windows.relative
         self.width = 2 * max(1, round(0.5 * seconds * sample_rate))
-        self.hop = max(self.width // 2, min(4 * self.width, round(LARGEST_HOP * sample_rate)))
+        self.hop = self.width // 2
+        if not gapless:
+            self.hop = max(self.hop, min(4 * self.width, round(LARGEST_HOP * sample_rate)))
         phi, phi_dot, _ = test_function(self.width, self.width / sample_rate, EXPONENT)
         self._phi, self._phi_dot = phi / sample_rate, phi_dot / sample_rate
         layout, n = model.layout, base.n
@@ -121,25 +132,39 @@ class JointBalance(Stage):
 
         signals (B, n_signals): see `Model.inputs`.
         """
+        for _, rows, measured in self.windows(x, v, signals):
+            for residual, row, signal in zip(self.state.residuals, rows, measured, strict=True):
+                if np.isfinite(row).all():
+                    residual.add(row, signal)
+
+    def windows(self, x: Array, v: Array, signals: Array) -> Iterator[tuple[int, Array, Array]]:
+        """Each window that further samples complete: its first sample, rows and measured torques or forces.
+
+        The sample is counted from the first of these, negative where it came before. rows (joints, ·): [Y D T b], see
+        `SquaredResidual`. measured (joints,): N m s (N s).
+        """
+        held = self.state.samples.shape[0]
         samples = np.concatenate((self.state.samples, np.concatenate((x, v, signals), axis=1)))
         start = self.state.skip
         while start + self.width + 1 <= samples.shape[0]:
-            self._add(samples[start : start + self.width + 1])
+            yield start - held, *self._window(samples[start : start + self.width + 1])
             start += self.hop
         dropped = min(start, samples.shape[0])
         self.state.samples, self.state.skip = samples[dropped:], start - dropped
 
-    def _add(self, samples: Array) -> None:
+    @property
+    def weight(self) -> float:
+        """∫ φ dt, s."""
+        return float(self._phi.sum())
+
+    def _window(self, samples: Array) -> tuple[Array, Array]:
         layout = self.model.layout
         x, v, signals = np.split(samples, [layout.n_x, layout.n_x + layout.n_v], axis=1)
         P, G = self.model.momentum_columns(x, v, layout.theta_m, self.model.inputs(signals))
         columns = -(np.tensordot(self._phi_dot, P, 1) + np.tensordot(self._phi, G, 1))
         measured = self._phi @ signals[:, : len(layout.q)]
         b = measured - self.base.known_part(columns)
-        rows = np.concatenate((self.base.columns(columns), *self._calibrated(x, signals), b[:, None]), axis=1)
-        for residual, row, signal in zip(self.state.residuals, rows, measured, strict=True):
-            if np.isfinite(row).all():
-                residual.add(row, signal)
+        return np.concatenate((self.base.columns(columns), *self._calibrated(x, signals), b[:, None]), axis=1), measured
 
     def _calibrated(self, x: Array, signals: Array) -> tuple[Array, ...]:
         """D and T (joints, ·) of a window's samples, none where no nuisances are estimated."""

@@ -12,10 +12,10 @@ class Observer:
     def samples(self, piece: GridSamples) -> None:
         """Grid samples of the channels that the model reads, as the synchroniser gives them."""
 
-    def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array) -> None:
+    def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array, states: Array) -> None:
         """Consecutive smoothed samples: grid index (B,), number of the segment, x (B, n_x), v (B, n_v).
 
-        inputs (B, inputs): n τ and measured wrenches.
+        inputs (B, inputs): n τ and measured wrenches. states (B, n_states): internal states of effects.
         """
 
     def block_through(self) -> None:

@@ -289,7 +289,7 @@ def _add_validate(verbs: Verbs) -> None:
     _add_recorded(parser)
     text = "results.json of a session, the folder of its run, or a system file, whose nominal values are used"
     parser.add_argument("--system", metavar="FILE|NAME", required=True, help=text)
-    _add_out(parser, "for validation.json; runs/<time> by default")
+    _add_out(parser, "for validation.json and validation.html; runs/<time> by default")
     _add_part(parser)
 
 

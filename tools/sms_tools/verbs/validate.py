@@ -1,9 +1,11 @@
-"""validate: what known parameters leave of the torques of another run."""
+"""validate: what known parameters leave of the torques and deflections of another run."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+
+from rich.table import Table
 
 from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.runs import read_results
@@ -30,8 +32,15 @@ def run(args: argparse.Namespace) -> int:
     with watched(args.capture, system, folder, args.start, args.stop) as reading:
         found = validate(system, Recorded(reading, str(args.capture)), parameters, gains)
     path = write_document(directory / NAME, found.to_json())
-    lines = [*(f"warning: {warning}" for warning in found.warnings), f"validation: {path}", "", found.sentence]
-    say(args, table(*found.rows(), left=("joint",)), "", *lines, document=found.to_json())
+    from sms_tools.html_report.validation_page import write_validation  # Matplotlib takes a second to be imported
+
+    page = write_validation(directory, found)
+    tables: list[Table | str] = [table(*found.rows(), left=("joint",)), ""]
+    if found.links:
+        tables += [table(*found.link_rows(), left=("link",)), ""]
+    warnings = [f"warning: {warning}" for warning in found.warnings]
+    files = [f"validation: {path}", f"page: {page}"]
+    say(args, *tables, *warnings, *files, "", found.sentence, document=found.to_json())
     return OK
 
 

@@ -1,0 +1,119 @@
+"""The torques that fixed parameters predict over a session, and the least that any parameters would leave of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sms_online.description.channels import channel_unit
+from sms_online.description.tree import index_of
+from sms_online.diagnosis.evidence import RANK_TOLERANCE
+from sms_online.diagnosis.residuals import rms
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.joint_balance import JointBalance
+from sms_online.pipeline.observer import Observer
+from sms_online.row_types import joint_rows
+from sms_online.stream import Array, Indices
+
+
+@dataclass(frozen=True)
+class TorqueCourse:
+    """A joint's torque or force at the motor's shaft over short windows, N m (N).
+
+    t (W,): middle of each window, s. measured (W,), predicted (W,): mean over it, weighted by its test function. unit:
+    of both.
+    """
+
+    unit: str
+    t: Array
+    measured: Array
+    predicted: Array
+
+    @property
+    def left(self) -> float:
+        """rms of the prediction error over rms of the torque."""
+        return rms(self.predicted - self.measured) / rms(self.measured)
+
+    @property
+    def zero(self) -> float:
+        """What the sensor reads too much throughout, N m (N), if the prediction is right."""
+        return float(np.mean(self.measured - self.predicted))
+
+    @property
+    def zero_share(self) -> float:
+        """Its size over rms of the torque."""
+        return abs(self.zero) / rms(self.measured)
+
+
+class TorquePrediction(Observer):
+    """Predicts the torques of a session window by window; put into `Estimator.observers`.
+
+    beta (n,): base parameters. known (m,): the session's nuisances. fixed: numbers of parameters that a fit to the run
+    leaves as they are.
+    """
+
+    def __init__(self, session: Estimator, beta: Array, known: Array, fixed: Sequence[int]) -> None:
+        sensing = None if session.sensing.missing else session.sensing
+        self._session, self._rate = session, session.system.sample_rate
+        self._balance = JointBalance(session.model, session.base, self._rate, sensing, gapless=True)
+        self._unknowns = [each.unknowns(beta, known) for each in self._balance.state.residuals]
+        self._free = np.setdiff1d(np.arange(beta.size), fixed)
+        # A torque at the shaft of 1 N m (N) in the rows.
+        self._unit = self._balance.weight * np.array([joint.gear_ratio for joint in session.system.joints])
+        self._segment = -1
+        self._windows: list[list[tuple[float, float, float]]] = [[] for _ in self._unit]
+        # Sums over windows of the products of [Y 1 r], joint by joint.
+        self._gram = np.zeros((self._unit.size, self._free.size + 2, self._free.size + 2))
+
+    def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array, states: Array) -> None:
+        """See `Observer`."""
+        if segment != self._segment:
+            self._segment = segment
+            self._balance.begin_segment()
+        for start, rows, measured in self._balance.windows(x, v, np.concatenate((inputs, states), axis=1)):
+            middle = (index[0] + start + self._balance.width // 2) / self._rate
+            for i, (row, unknowns, torque) in enumerate(zip(rows, self._unknowns, measured, strict=True)):
+                if np.isfinite(row).all():
+                    error = float(row @ unknowns)
+                    self._windows[i].append((middle, torque / self._unit[i], (torque + error) / self._unit[i]))
+                    columns = np.concatenate((row[self._free], [1.0, error]))
+                    self._gram[i] += np.outer(columns, columns)
+
+    @property
+    def courses(self) -> dict[str, TorqueCourse]:
+        """By `joint_i`; those without a torque are left out."""
+        start, out = self._session.start_time, {}
+        for i, windows in enumerate(self._windows):
+            if windows:
+                t, measured, predicted = np.array(windows).T
+                if measured.any():
+                    unit = channel_unit(self._session.system, f"tau_{i + 1}")
+                    out[joint_rows(i)] = TorqueCourse(unit, start + t, measured, predicted)
+        return out
+
+    def least(self) -> dict[str, float]:
+        """By joint, the share of its torque that parameters leave which fit the whole run best, beside its zero.
+
+        They fit the torques of all joints, each relative to its own.
+        """
+        left, raw = {}, np.zeros(self._free.size)
+        for name, course in self.courses.items():
+            i = index_of(name)
+            # The mean of a column is what the zero of the torque takes of it.
+            gram, count = np.delete(np.delete(self._gram[i], -2, 0), -2, 1), self._gram[i][-2, -2]
+            mean = np.delete(self._gram[i][-2], -2) / count
+            signal = float(np.sum((course.measured * self._unit[i]) ** 2))
+            left[name] = (gram - count * np.outer(mean, mean)) / signal
+            raw += np.diag(gram)[:-1] / signal
+        total = np.sum(list(left.values()), axis=0)
+        squares = np.diag(total)[:-1]
+        # Of a column that is a zero itself only rounding is left.
+        varies = np.flatnonzero(squares > RANK_TOLERANCE * raw)
+        size = np.sqrt(squares[varies])
+        scaled = total[np.ix_(varies, varies)] / np.outer(size, size)
+        change = np.zeros(self._free.size)
+        change[varies] = np.linalg.lstsq(scaled, -total[varies, -1] / size, rcond=RANK_TOLERANCE)[0] / size
+        w = np.append(change, 1.0)
+        return {name: float(np.sqrt(max(0.0, w @ gram @ w))) for name, gram in left.items()}
