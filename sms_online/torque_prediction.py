@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import channel_unit
+from sms_online.description.channels import channel_unit, drive_channel
 from sms_online.description.tree import index_of
 from sms_online.diagnosis.evidence import RANK_TOLERANCE
 from sms_online.diagnosis.residuals import rms
@@ -84,12 +84,12 @@ class TorquePrediction(Observer):
     @property
     def courses(self) -> dict[str, TorqueCourse]:
         """By `joint_i`; those without a torque are left out."""
-        start, out = self._session.start_time, {}
+        system, start, out = self._session.system, self._session.start_time, {}
         for i, windows in enumerate(self._windows):
             if windows:
                 t, measured, predicted = np.array(windows).T
                 if measured.any():
-                    unit = channel_unit(self._session.system, f"tau_{i + 1}")
+                    unit = channel_unit(system, drive_channel(system, i + 1))
                     out[joint_rows(i)] = TorqueCourse(unit, start + t, measured, predicted)
         return out
 

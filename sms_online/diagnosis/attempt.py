@@ -244,6 +244,7 @@ class Attempt(Hypothesis):
 
     @cached_property
     def _joints(self) -> RelativeResiduals:
+        """Rows of the joints' torques."""
         return RelativeResiduals(self.rows, self.make)
 
     def test(self, chosen: Sequence[int]) -> dict[str, RowResidual]:
@@ -281,11 +282,8 @@ class Attempt(Hypothesis):
 
     def _elsewhere(self, effects: Sequence[Effect], solution: Array) -> Part:
         """What the model with a solution (n + c,) leaves of the capture that is held out."""
-        own = self.rows
-        rows = SessionRows(
-            own.model, own.base, own.sensing, own.noise, self._held, own.beta, second_order=own.second_order
-        )
-        make = CandidateColumns(rows, self.make.system)
+        make = self._made_elsewhere()
+        rows = make.rows
         held = CandidateRows(
             rows,
             [make.of(effect) for effect in effects],
@@ -299,6 +297,19 @@ class Attempt(Hypothesis):
         joints = RelativeResiduals(rows, make)
         joints.declare([*self.constants, *effects])
         return Part(whitened(rows, held.residual(everything, solution)), joints.of(solution))
+
+    def _made_elsewhere(self) -> CandidateColumns:
+        """Candidates' columns, and with them the rows, of the capture that is held out."""
+        own = self.rows
+        rows = SessionRows(
+            own.model, own.base, own.sensing, own.noise, self._held, own.beta, second_order=own.second_order
+        )
+        return CandidateColumns(rows, self.make.system)
+
+    def joints_elsewhere(self) -> RelativeResiduals:
+        """Rows of the joints' torques in the capture that is held out, of all its samples."""
+        make = self._made_elsewhere()
+        return RelativeResiduals(make.rows, make, gapless=True)
 
     def steps(self, chosen: Sequence[int]) -> list[Step]:
         """The way of the last search, with the weights of those chosen in the end."""

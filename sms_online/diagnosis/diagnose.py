@@ -26,11 +26,13 @@ from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.search import Search
+from sms_online.diagnosis.torque_zeros import HELD_OUT, torque_zeros, without_zeros
 from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.row_types import LARGEST_RESIDUAL
 from sms_online.stream import Block
 from sms_online.threads import one_blas_thread
@@ -66,7 +68,7 @@ def diagnose(
     before, record = _session(
         system, runs, source, prior, lambda share: progress("fitting the model as described", FITTED_ONCE * share)
     )
-    _check_noise(before, source)
+    _noise(before, source)
     progress("looking for mistakes of units, signs and wiring", FITTED_ONCE)
     corrected = find_mistakes(before, record.segments())
     mistakes = (*([] if clock is None else [clock]), *corrected.mistakes)
@@ -75,19 +77,24 @@ def diagnose(
         system = corrected.system
         runs, holdout = [undone(run, corrected) for run in runs], undone(holdout, corrected)
         before, record = _session(system, runs, source, prior)
-        _check_noise(before, source)
-    assert before.momentum is not None
-    assert before.momentum.sensor_noise is not None
+        _noise(before, source)
     held = _session(system, [holdout], source, prior)[1].segments() if holdout else []
     case = Case(
-        source, before, before.momentum.sensor_noise, record.segments(), held, prior, progress, stop, learned,
+        source, before, _noise(before, source), record.segments(), held, prior, progress, stop, learned,
         begins(runs),
     )  # fmt: skip
     progress("tracing what it leaves", FITTED_ONCE)
-    try:
+    case, attempt = _first(case, system)
+    zeros = torque_zeros(attempt) if further or holdout else []
+    if zeros:
+        progress("; ".join(zero.sentence for zero in zeros), FITTED_ONCE)
+        runs = [without_zeros(run, zeros, number) for number, run in enumerate(runs)]
+        before, record = _session(system, runs, source, prior)
+        if holdout:
+            held = _session(system, [without_zeros(holdout, zeros, HELD_OUT)], source, prior)[1].segments()
+        noise = _noise(before, source)
+        case = replace(case, session=before, noise=noise, segments=record.segments(), held=held)
         case, attempt = _first(case, system)
-    except np.linalg.LinAlgError as error:
-        raise InputError(source, "", str(error), "the links' own markers, in their frames") from error
     followed = before
     described = attempt
     # From one capture to the next parameters may change at once.
@@ -178,6 +185,7 @@ def diagnose(
         verdict=said,
         partial=partial,
         mistakes=mistakes,
+        zeros=zeros,
         calibration=calibration,
         findings=findings,
         late=late,
@@ -199,9 +207,13 @@ def _first(case: Case, system: System) -> tuple[Case, Attempt]:
 
     Rows that leave more than noise whatever is added contradict what is known beforehand, and effects that there are
     not would reconcile the two: what they lack is searched by what they say alone.
+    InputError where readings are of shapes that links do not have.
     """
     alone = replace(case, use_prior=False)
-    attempt = Attempt(alone, system)
+    try:
+        attempt = Attempt(alone, system)
+    except np.linalg.LinAlgError as error:
+        raise InputError(case.source, "", str(error), "the links' own markers, in their frames") from error
     if attempt.tracing.exceeds or case.prior(case.session) is None:
         return alone, attempt
     return case, Attempt(case, system)
@@ -262,9 +274,12 @@ def _check_balanced(session: Estimator, source: str) -> None:
         )
 
 
-def _check_noise(session: Estimator, source: str) -> None:
-    if session.momentum is not None and session.momentum.sensor_noise is None:
+def _noise(session: Estimator, source: str) -> SensorNoise:
+    """The sensors' noise as a session found it; InputError where it had too few samples."""
+    noise = None if session.momentum is None else session.momentum.sensor_noise
+    if noise is None:
         raise InputError(source, "", "too few samples to estimate the sensors' noise", "a longer capture")
+    return noise
 
 
 def _beyond(attempt: Attempt, chosen: Sequence[int]) -> bool:

@@ -14,6 +14,7 @@ from sms_online.diagnosis.hypothesis import LARGEST_SHARE_LEFT
 from sms_online.diagnosis.posterior import coefficients, posterior
 from sms_online.diagnosis.reported import Coefficients
 from sms_online.diagnosis.search import Search
+from sms_online.diagnosis.torque_zeros import HELD_OUT
 from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
 from sms_online.result import residual_document, result_of
 from sms_online.row_types import Residual
@@ -62,6 +63,17 @@ def diagnosis_document(
             }
             for mistake in diagnosis.mistakes
         ],
+        "torque_zeros": [
+            {
+                "channel": zero.channel,
+                "capture": None if zero.capture == HELD_OUT else zero.capture + 1,
+                "offset": zero.offset,
+                "std": zero.std,
+                "unit": zero.unit,
+                "sentence": zero.sentence,
+            }
+            for zero in diagnosis.zeros
+        ],
         "calibration": [
             {**each.document(), "sentence": str(each), "next_step": each.advice} for each in diagnosis.calibration
         ],
@@ -105,6 +117,7 @@ def diagnosis_document(
         ],
         "warnings": [
             *warnings,
+            *(zero.sentence for zero in diagnosis.zeros),
             # Those of a session are of its parameters, which are not those reported where these come from rows.
             *(_after(diagnosis, sessions["after"]).warnings if given else sessions["after"].warnings),
         ],

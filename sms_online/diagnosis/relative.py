@@ -21,12 +21,14 @@ class RelativeResiduals:
     """Rows of the joints over the session, of a model and of effects beside it.
 
     times (W,): the windows' middles, s since grid index 0. segment (W,): numbers of the segments that hold them.
+    measured (W, joints): torques or forces. unit (joints,): one N m (N) at the motor's shaft, in rows.
     """
 
-    def __init__(self, rows: SessionRows, make: CandidateColumns) -> None:
+    def __init__(self, rows: SessionRows, make: CandidateColumns, gapless: bool = False) -> None:
+        """gapless: windows that overlap by half, in place of those that a session is judged by."""
         layout = rows.model.layout
         self._joints = list(layout.theta_m)
-        weak = joint_windows(rows)
+        weak = joint_windows(rows, gapless)
         # The relative residual of a session (`JointBalance`), too, foretells friction at a standstill by its law.
         self._make = make.within(weak, resting=True)
         starts, segments = weak.windows.start, weak.windows.segment
@@ -45,7 +47,9 @@ class RelativeResiduals:
         self._Y = rows.base.columns(physical)
         joints = len(layout.q)
         torque = -weak.columns(lambda motion: (None, motion.torque[:, :joints, None]))[..., 0]
-        self._measured = torque
+        one = -weak.columns(lambda motion: (None, np.ones((len(motion.x), joints, 1))))[..., 0]
+        self.unit = one.mean(axis=0) * [joint.gear_ratio for joint in rows.model.system.joints]
+        self.measured = torque
         self._b = torque - rows.base.known_part(physical)
         self._effects: list[Array] = []
         names = [p.name for p in rows.base.parameters]
@@ -86,17 +90,22 @@ class RelativeResiduals:
 
         Calibration is that of deflections and torques.
         """
-        columns = np.concatenate([self._Y, *self._effects], axis=2)
-        c = columns.shape[2]
-
-        def left(each: Array) -> Array:
-            stiffness = [0.0 if k is None else each[k] for k in self._springs]
-            calibrated = stiffness * (self._deflections @ each[c:]) - self._torques @ each[c:]
-            return np.asarray(self._b - columns @ each[:c] + calibrated)
-
-        rest = left(solution)
+        rest = self.left(solution)
         for windows, other in held:
-            rest[windows] = left(other)[windows]
-        size = np.linalg.norm(self._measured, axis=0)
+            rest[windows] = self.left(other)[windows]
+        size = np.linalg.norm(self.measured, axis=0)
         ratio = np.divide(np.linalg.norm(rest, axis=0), size, out=np.zeros_like(size), where=size > 0.0)
         return {joint_rows(i): float(r) for i, r in enumerate(ratio)}
+
+    @property
+    def columns(self) -> Array:
+        """Of the parameters and the effects declared, (W, joints, n + c)."""
+        return np.concatenate([self._Y, *self._effects], axis=2)
+
+    def left(self, solution: Array) -> Array:
+        """What a solution (n + c + m,) leaves of the torques in the rows, (W, joints)."""
+        columns = self.columns
+        c = columns.shape[2]
+        stiffness = [0.0 if k is None else solution[k] for k in self._springs]
+        calibrated = stiffness * (self._deflections @ solution[c:]) - self._torques @ solution[c:]
+        return np.asarray(self._b - columns @ solution[:c] + calibrated)

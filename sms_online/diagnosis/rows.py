@@ -244,10 +244,10 @@ def _middle(half_widths: list[int]) -> int:
     return sorted(half_widths)[len(half_widths) // 2]
 
 
-def joint_windows(rows: SessionRows) -> WeakWindows:
+def joint_windows(rows: SessionRows, gapless: bool = False) -> WeakWindows:
     """The windows of the relative residual over the same session: those of `JointBalance`, all samples seen."""
     system = rows.model.system
-    balance = JointBalance(rows.model, rows.base, system.sample_rate)
+    balance = JointBalance(rows.model, rows.base, system.sample_rate, gapless=gapless)
     M = _middle(rows.weak.windows.half_width.tolist())
     starts = [
         np.arange(M, segment.index.size - M - balance.width - 1, balance.hop, dtype=np.int64)

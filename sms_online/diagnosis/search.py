@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,6 +12,7 @@ from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.hypothesis import share_left
 from sms_online.diagnosis.late_sensors import LateSensor
 from sms_online.diagnosis.mistakes import Mistake
+from sms_online.diagnosis.torque_zeros import TorqueZero
 from sms_online.diagnosis.unexplained import Unexplained
 from sms_online.effects.build import build_model
 from sms_online.model.model import Model
@@ -24,6 +26,7 @@ class Search:
 
     verdict: "clean", "named" or "unexplained". partial: the search was ended before it was done, and parameters after
     are those of its rows. mistakes: of wiring, units and signs, undone in all that follows.
+    zeros: of torques that differed from capture to capture, taken off.
     calibration: what the description is off by, beyond its tolerances, that no effect of the catalogue says.
     findings: constants first, then the effects that are unknowns of π.
     late: sensors far behind the others, whose lag the description of the last attempt states. steps: of the last
@@ -51,6 +54,7 @@ class Search:
     estimator_after: Estimator
     unexplained: Unexplained | None
     drifts: tuple[Drift, ...] = ()
+    zeros: Sequence[TorqueZero] = ()
 
     @property
     def left(self) -> float:

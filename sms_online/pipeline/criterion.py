@@ -323,7 +323,7 @@ def _basis(information: Array) -> Array:
 
 def _unit_scale(information: Array) -> Array:
     """Scale (n,) of parameters that makes their own information one, zero where they have none."""
-    size = np.sqrt(np.diag(information))
+    size = np.sqrt(np.maximum(np.diag(information), 0.0))
     return np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
 
 

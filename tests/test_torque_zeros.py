@@ -1,0 +1,56 @@
+"""Zeros of torques that differ between captures of one rig, beside friction that nobody described."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sms_online as sms
+from sms_online.description.parse import parse_system
+from tests.test_compare import ELASTIC_AXIS, STIFFNESS
+
+FRICTION = ["coulomb_friction@joint_1:torque=0.5"]
+# Of the rms of the torque.
+SECOND, HELD_OUT = 0.3, -0.2
+
+
+@pytest.fixture(scope="module")
+def system() -> sms.System:
+    return parse_system(ELASTIC_AXIS.format(stiffness=STIFFNESS), "rig.toml")
+
+
+@pytest.fixture(scope="module")
+def captures(system: sms.System) -> list[sms.Capture]:
+    return [sms.simulate(system, grade="B", seed=seed, effects=FRICTION) for seed in range(3)]
+
+
+def shifted(capture: sms.Capture, share: float) -> tuple[sms.Capture, float]:
+    """A capture whose torque reads too much by a share of its rms, and that torque."""
+    torque = capture.channels.index("tau_1")
+    offset = share * float(np.sqrt(np.mean(capture.values[:, torque] ** 2)))
+    values = capture.values.copy()
+    values[:, torque] += offset
+    return replace(capture, values=values), offset
+
+
+def test_zeros_that_differ_are_taken_off(system: sms.System, captures: list[sms.Capture]) -> None:
+    second, offset = shifted(captures[1], SECOND)
+    third, offset_held_out = shifted(captures[2], HELD_OUT)
+    found = sms.diagnose(system, [captures[0], second], holdout=third)
+    assert [(each.name, each.where) for each in found.effects] == [("coulomb_friction", "joint_1")]
+    assert found.verdict == "named"
+    zeros = found.document()["torque_zeros"]
+    assert [zero["capture"] for zero in zeros] == [2, None]
+    for zero, true in zip(zeros, (offset, offset_held_out), strict=True):
+        assert zero["channel"] == "tau_1"
+        assert abs(zero["offset"] - true) < 3.0 * zero["std"]
+        assert zero["std"] < 0.1 * abs(true)
+    assert len([warning for warning in found.warnings if "tau_1 reads" in warning]) == len(zeros)
+
+
+def test_equal_zeros_are_left_alone(system: sms.System, captures: list[sms.Capture]) -> None:
+    found = sms.diagnose(system, captures[:2], holdout=captures[2])
+    assert found.document()["torque_zeros"] == []
+    assert [each.name for each in found.effects] == ["coulomb_friction"]
