@@ -167,3 +167,16 @@ def test_a_perfect_model_with_noisy_torques_is_clean() -> None:
     std = np.sqrt(np.diag(attempt.tracing.covariance([])))[: true.size]
     off = (attempt.solution([])[: true.size] - true) / std
     assert np.max(np.abs(off)) < 4.0
+
+
+def test_an_eccentricity_within_its_tolerance_is_no_effect() -> None:
+    calibrated = attempt().rows.calibrated
+    tolerance = bench().tolerances.once_per_turn
+
+    def of(size: float, phase: float = 1.0) -> Effect:
+        return Effect(name="encoder_eccentricity", where="q_1", coefficients={"amplitude": size, "phase": phase})
+
+    assert calibrated.tolerates(of(0.1 * tolerance))
+    assert not calibrated.tolerates(of(100.0 * tolerance))
+    # A lag is limited by what it is a lag behind, not by clocks.
+    assert not calibrated.tolerates(Effect(name="sensor_lag", where="q_1", coefficients={"corner": 1e4}))

@@ -83,6 +83,12 @@ class Calibrated:
         effects = list(effects)
         return np.array([any(_replaces(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
 
+    def tolerates(self, constant: Effect) -> bool:
+        """Whether a zero or an eccentricity is no more than what is tolerated of a sensor anyway."""
+        own = [each.tolerance for each in self.nuisances if _replaces(constant, each) and each.name != "clock"]
+        # Its first coefficient is its size in their unit.
+        return bool(own) and abs(next(iter(constant.coefficients.values()))) <= LIMIT * max(own)
+
     def beyond(self, values: Array) -> Mask:
         """Which of them (m,) an effect of the catalogue has to replace, for estimates (m,)."""
         said = np.array([each.name in self.covered for each in self.nuisances], dtype=np.bool_)

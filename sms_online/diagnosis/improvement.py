@@ -43,7 +43,9 @@ def with_constants(
         constants, beta = correction.constants, correction.solution[: attempt.rows.base.n]
         forces = attempt.found(chosen, attempt.solution(chosen))[1]
         keys = {effect.key for effect in constants}
-        constants = [effect for effect in constants if possible(effect, case.session.system.sample_rate)]
+        # What explained a part of another constant may have next to nothing left beside it.
+        rate, tolerated = case.session.system.sample_rate, attempt.rows.calibrated.tolerates
+        constants = [effect for effect in constants if possible(effect, rate) and not tolerated(effect)]
         tried = [candidate.effect for candidate in attempt.tracing.candidates]
         others = [effect for effect in tried if effect.key not in keys]
         attempt = Attempt(case, attempt.system, constants, beta, others)
