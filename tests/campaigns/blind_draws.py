@@ -24,6 +24,8 @@ SYSTEM = "paper-planar"
 GRADE = "B"
 # Worth of an effect, share of the rms of the rows it acts on.
 WORTH = (0.02, 0.2)
+# Share of what the catalogue takes for possible that a coefficient is drawn up to.
+LARGEST = 0.9
 # Noise of grade B is 1e-4 m and rad: motions are simulated to a ten-thousandth of it.
 TOLERANCE = 1e-8
 # Exact samples of the arm without an effect.
@@ -80,6 +82,9 @@ class Draw:
         shares = np.sqrt(np.mean(added**2, axis=0)) / self._size, np.abs(added).max(axis=0) / self._peak
         worth = float(np.max(shares))
         stated = self._stated(name, drawn.where, direction * wanted / worth, shapes)
+        # What the catalogue takes for impossible is named nowhere.
+        most = {key: LARGEST * limit for key, (_, limit) in ENTRIES[name].traits.limits.items()}
+        stated = {key: min(value, most.get(key, np.inf)) for key, value in stated.items()}
         # So that the last digits of the estimator do not draw other cases.
         return plain.model_copy(update={"coefficients": {key: float(f"{value:.6g}") for key, value in stated.items()}})
 
