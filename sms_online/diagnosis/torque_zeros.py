@@ -34,7 +34,7 @@ class TorqueZero:
     """What a joint's torque or force reads more in a capture than in the first.
 
     channel: of the drive. capture: its number, that of the one held out is HELD_OUT. offset, std: at the motor's shaft,
-    in `unit`.
+    in `unit`. gravity: whether another load of the arm would show as such a zero.
     """
 
     channel: str
@@ -42,13 +42,15 @@ class TorqueZero:
     offset: float
     std: float
     unit: str
+    gravity: bool = False
 
     @property
     def sentence(self) -> str:
         """In words, with captures counted from 1."""
         where = "the capture held out" if self.capture == HELD_OUT else f"capture {self.capture + 1}"
         size = f"{abs(self.offset):.2g} ± {self.std:.1g} {self.unit} {'more' if self.offset > 0.0 else 'less'}"
-        return f"{self.channel} reads {size} in {where} than in the first, which was taken off"
+        load = "; where its zero is the same, the arm carries another load" if self.gravity else ""
+        return f"{self.channel} reads {size} in {where} than in the first, which was taken off{load}"
 
 
 def torque_zeros(attempt: Attempt) -> list[TorqueZero]:
@@ -64,7 +66,7 @@ def torque_zeros(attempt: Attempt) -> list[TorqueZero]:
     described = attempt.solution([])
     solution = np.concatenate((described[:n], np.zeros(joints.columns.shape[2] - n), described[n:]))
     fit = _Fit(joints, solution, np.searchsorted(attempt.case.begins, joints.times))
-    others = [(k, *fit.against_first(k)) for k in range(1, len(attempt.case.begins) + 1)]
+    others = [(k, *fit.against_first(k)) for k in fit.captures[1:]]
     if attempt.case.held:
         elsewhere = attempt.joints_elsewhere()
         elsewhere.declare(_few(losses, joints.measured.size))
@@ -73,7 +75,8 @@ def torque_zeros(attempt: Attempt) -> list[TorqueZero]:
     for capture, offset, std, size in others:
         for i in np.flatnonzero(np.abs(offset) > np.maximum(LEAST_SHARE * size, LEAST_DEVIATIONS * std)):
             channel = drive_channel(system, int(i) + 1)
-            out.append(TorqueZero(channel, capture, float(offset[i]), float(std[i]), channel_unit(system, channel)))
+            unit, gravity = channel_unit(system, channel), any(system.gravity)
+            out.append(TorqueZero(channel, capture, float(offset[i]), float(std[i]), unit, gravity))
     return out
 
 
@@ -98,8 +101,9 @@ class _Fit:
         self._weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
         A = columns * self._weight[:, None]
         raw = np.linalg.norm(A, axis=(0, 1))
-        self._captures = [capture == k for k in np.unique(capture)]
-        for own in self._captures:
+        # Those too short for a window have none.
+        self._captures = {k: capture == k for k in np.unique(capture).tolist()}
+        for own in self._captures.values():
             A[own] -= A[own].mean(axis=0)
         norm = np.linalg.norm(A, axis=(0, 1))
         # Of a column that is a zero itself only rounding is left.
@@ -110,11 +114,16 @@ class _Fit:
         self._change = change.reshape(-1, *left.shape) * self._weight
         self._solution[self._varies] += np.tensordot(self._change, left, 2)
         rest = joints.left(self._solution)
-        self._zero = np.array([rest[own].mean(axis=0) for own in self._captures])
-        for own, zero in zip(self._captures, self._zero, strict=True):
-            rest[own] -= zero
-        spare = max(1, left.size - self._varies.size - self._zero.size)
+        self._zero = {k: rest[own].mean(axis=0) for k, own in self._captures.items()}
+        for k, own in self._captures.items():
+            rest[own] -= self._zero[k]
+        spare = max(1, left.size - self._varies.size - len(self._zero) * size.size)
         self._rest = rest * np.sqrt(left.size / spare)
+
+    @property
+    def captures(self) -> list[int]:
+        """Numbers of those that were fitted."""
+        return list(self._captures)
 
     def against_first(self, k: int) -> tuple[Array, Array, Array]:
         """What torques at the shaft read more in a capture than in the first, its deviation, and the torque's rms."""
@@ -137,7 +146,7 @@ class _Fit:
 
         mean (joints, n + c): of the columns in its capture. errors (W, joints): its own.
         """
-        first = self._captures[0]
+        first = self._captures[self.captures[0]]
         errors = errors - np.where(first[:, None], self._rest / first.sum(), 0.0)
         difference = (mean - self._joints.columns[first].mean(axis=0))[:, self._varies]
         # Rows of all joints change the solution, and with it the mean of each.
@@ -147,7 +156,7 @@ class _Fit:
     def _at_shaft(self, zero: Array, variance: Array, measured: Array) -> tuple[Array, Array, Array]:
         unit = self._joints.unit
         size = np.sqrt(np.mean(measured**2, axis=0)) / unit
-        return (zero - self._zero[0]) / unit, np.sqrt(variance) / unit, size
+        return (zero - self._zero[self.captures[0]]) / unit, np.sqrt(variance) / unit, size
 
 
 def _of_sum(errors: Array) -> Array:
