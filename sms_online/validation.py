@@ -15,6 +15,7 @@ from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.schema import System
 from sms_online.diagnosis.residuals import RowResidual
+from sms_online.effects.catalogue import declares
 from sms_online.errors import InputError
 from sms_online.evaluation import negative
 from sms_online.fixed_residual import FixedResidual, TypeResidual
@@ -175,7 +176,7 @@ class Validation(Tabled):
             return (
                 f"The parameters hold on this run but for the zeros of torques: {zeros} at the shaft, {share} "
                 f"{100.0 * worst.beside_zero:.2g} % is left. Zero the sensors before each run, or declare "
-                f"torque_offset@{name} and fit it."
+                f"{declares('drive_offset')}@{name} and fit it."
             )
         if verdict == "unexplained":
             name, worst = max((each for each in joints if each[1].unexplained), key=lambda item: item[1].left)

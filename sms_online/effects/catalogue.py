@@ -82,6 +82,11 @@ OF_SPRINGS = ("deflection", "load")
 BEGINNING = tuple(sorted(entry.name for entry in ENTRIES.values() if entry.traits.begins))
 
 
+def declares(tolerance: str) -> str:
+    """Name of the first effect whose declaration says what a field of `Tolerances` allows for."""
+    return next(name for name, entry in ENTRIES.items() if tolerance in entry.traits.calibrates)
+
+
 def places(system: System, at: Place) -> tuple[str, ...]:
     """Where effects of a kind of place may sit in a system; for channels, the channels."""
     joints = [f"joint_{i}" for i in range(1, len(system.joints) + 1)]
