@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sms_adapters.channel_check import UNIT_TOLERANCE, ChannelCheck, Remark
+from sms_adapters.encoder_pairs import encoder_pairs
 from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channel_unit, drive_channels, sensed_channels
 from sms_online.description.given import Given, given_system
@@ -149,6 +150,7 @@ class ChannelChecks:
             period = None if rate is None else 1.0 / rate
             self.checks.append(ChannelCheck(name, channel_unit(system, name), period, resolution))
         self._waiting = np.empty((0, len(self.channels)))
+        self._pairs = encoder_pairs(system, self.channels)
         self._guard = StuckGuard([[k] for k in range(len(self.channels))])
 
     def push(self, block: Block) -> None:
@@ -160,6 +162,8 @@ class ChannelChecks:
         there = ~np.isnan(block.values)
         for k, check in enumerate(self.checks):
             check.push(block.t[there[:, k]], block.values[there[:, k], k])
+        for pair in self._pairs:
+            pair.push(block.values)
         # In pieces of one size, so that it does not matter how the samples are cut into blocks.
         self._waiting = np.concatenate((self._waiting, block.values))
         while len(self._waiting) >= PIECE:
@@ -182,6 +186,8 @@ class ChannelChecks:
         """What is the matter so far."""
         for check in self.checks:
             yield from check.remarks()
+        for pair in self._pairs:
+            yield from pair.remarks()
         # Where a sensor says how often it samples, its channels are compared with that, and remarked upon already.
         if (unit := self.other_unit_of_time) is not None and not self._described:
             period = min(period for check in self.checks if (period := check.measured_period))
@@ -234,7 +240,8 @@ def check(system: Given, data: Data) -> Check:
     It says what is the matter with its channels, and what its motion determines. system: described, or its name or
     file. data: a capture, the path of one, of a log or of a recording, or blocks of samples in order of time. Rates,
     stamps and resolutions are compared with the description; stuck, saturated and wrapped channels are named, those
-    with outliers, and those that nobody reads. InputError where the data cannot be read.
+    with outliers, encoders of one joint that do not turn alike, and channels that nobody reads. InputError where the
+    data cannot be read.
     """
     system, folder = given_system(system)
     recorded = recorded_session(system, data, folder)

@@ -1,0 +1,55 @@
+"""Encoders of one joint that do not turn alike, as `check` and a running session say it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sms_online as sms
+
+SYSTEM = "paper-planar"  # springs that give way by a quarter of the motion
+GEAR = 50.0
+
+
+@pytest.fixture(scope="module")
+def capture() -> sms.Capture:
+    return sms.simulate(SYSTEM, duration=3.0, grade="B", seed=1)
+
+
+def scaled(capture: sms.Capture, channel: str, factor: float) -> sms.Capture:
+    values = capture.values.copy()
+    values[:, capture.channels.index(channel)] *= factor
+    return replace(capture, values=values)
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor", "said"),
+    [
+        ("q_1", np.rad2deg(1.0), "it is in degrees"),
+        ("theta_m_1", np.rad2deg(1.0), "it is in degrees"),
+        ("theta_m_2", GEAR, "the motor's angle before the gear"),
+        ("theta_m_1", 6.0, "one of them is in another unit"),
+        ("theta_m_2", -1.0, "one of them has the wrong sign"),
+        ("q_1", -1000.0, "one of them is in another unit, and one of them has the wrong sign"),
+    ],
+)
+def test_encoders_that_do_not_turn_alike_are_named(
+    capture: sms.Capture, channel: str, factor: float, said: str
+) -> None:
+    found = sms.check(SYSTEM, scaled(capture, channel, factor))
+    assert not found.passed
+    grave = [remark for remark in found.remarks if remark.grave and "turns" in remark.text]
+    assert len(grave) == 1
+    assert said in grave[0].text
+    assert {grave[0].channel, grave[0].text.split(" as far as ")[1].split(",")[0].split(":")[0]} == {
+        f"q_{channel[-1]}",
+        f"theta_m_{channel[-1]}",
+    }
+
+
+def test_encoders_on_either_side_of_a_soft_spring_are_alike(capture: sms.Capture) -> None:
+    found = sms.check(SYSTEM, capture)
+    assert found.passed
+    assert not [remark for remark in found.remarks if "turns" in remark.text]
