@@ -11,7 +11,7 @@ from sms_online.description.schema import System
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import SampleRecord, bounded, excerpts
-from sms_online.diagnosis.residuals import ResidualTest, RowResidual, whitened
+from sms_online.diagnosis.residuals import ResidualTest, RowResidual, rms
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.relinearisation import NOISE_RENEWED, PASS_BAND
@@ -25,11 +25,16 @@ ELASTIC = ("stiffness", "rigidity", "rigidity_y", "rigidity_z")
 
 
 @dataclass(frozen=True)
-class TypeResidual:
-    """What is left of one row type. rows: over its noise. elastic: as a share of elastic forces, None without any."""
+class ElasticResidual:
+    """What is left of the rows of a joint's spring or of a link's deflection, as a share of its elastic force.
 
+    left: with everything fixed. least: with its own stiffness or rigidities fitted to the run. rows: over noise. All
+    are root mean squares of rows in units of their noise.
+    """
+
+    left: float
+    least: float
     rows: RowResidual
-    elastic: float | None
 
 
 class FixedResidual:
@@ -63,10 +68,11 @@ class FixedResidual:
             self._renewed = float(block.t[-1])
             self._noise = self._estimate.noise(self._session.periods, self._system)
 
-    def by_type(self, beta: Array, gains: Mapping[str, float]) -> dict[str, TypeResidual]:
-        """What parameters β (n,) leave by row type; empty where there are too few samples, or noise has no effect.
+    def of(self, beta: Array, gains: Mapping[str, float]) -> tuple[dict[str, RowResidual], dict[str, ElasticResidual]]:
+        """What parameters β (n,) leave by row type, and by spring and flexible link.
 
-        gains: share by which joints' torques are read too large, by name.
+        Both are empty where there are too few samples, or noise has no effect; springs and links whose stiffness is no
+        parameter are left out. gains: share by which joints' torques are read too large, by name.
         """
         session, noise, sensing = self._session, self._noise, self._session.sensing
         length, most = bounded(self._system)
@@ -74,18 +80,37 @@ class FixedResidual:
         least = least_samples(self._system)
         segments = [part for part in excerpts(whole, length, most) if part.index.size > least]
         if noise is None or noise.exact or not segments:
-            return {}
+            return {}, {}
         try:
             rows = SessionRows(session.model, session.base, sensing, noise, segments, beta)
         except np.linalg.LinAlgError:
             # Readings that no shape of the links gives.
-            return {}
+            return {}, {}
         nuisances = rows.calibrated.nuisances
         held = np.array([gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in nuisances])
-        residual = rows.Y @ beta + rows.calibrated.columns @ held - rows.b
-        elastic = [k for k, each in enumerate(session.base.parameters) if each.name.endswith(ELASTIC)]
-        force = whitened(rows, rows.Y[..., elastic] @ beta[elastic] / rows.std)
-        return {
-            name: TypeResidual(each, each.whitened / force[name] if force[name] > 0.0 else None)
-            for name, each in ResidualTest(rows).of(residual / rows.std).items()
-        }
+        residual = (rows.Y @ beta + rows.calibrated.columns @ held - rows.b) / rows.std
+        return ResidualTest(rows).of(residual), _elastic(rows, beta, residual)
+
+
+def _elastic(rows: SessionRows, beta: Array, residual: Array) -> dict[str, ElasticResidual]:
+    layout = rows.model.layout
+    joints = enumerate(zip(layout.q, layout.theta_m, strict=True), start=1)
+    springs = {f"joint_{i}": [q] for i, (q, theta_m) in joints if q != theta_m}
+    shapes = enumerate(layout.q_f, start=1)
+    links = {f"link_{i}": list(range(q_f.start, q_f.stop)) for i, q_f in shapes if q_f.stop > q_f.start}
+    places = springs | links
+    if not places:
+        return {}
+    tested, out = ResidualTest(rows, places).of(residual), {}
+    for place, speeds in places.items():
+        own = [
+            k
+            for k, each in enumerate(rows.base.parameters)
+            if each.name.startswith(f"{place}.") and each.name.endswith(ELASTIC)
+        ]
+        columns = (rows.Y[:, speeds][..., own] / rows.std[:, speeds, None]).reshape(-1, len(own))
+        force, left = columns @ beta[own], residual[:, speeds].ravel()
+        if np.any(force):
+            fitted = left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
+            out[place] = ElasticResidual(rms(left) / rms(force), rms(fitted) / rms(force), tested[place])
+    return out

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.description.channels import channel_unit, drive_channel
+from sms_online.description.channels import channel_unit
 from sms_online.description.tree import index_of
 from sms_online.diagnosis.evidence import RANK_TOLERANCE
 from sms_online.diagnosis.residuals import rms
@@ -20,12 +20,13 @@ from sms_online.stream import Array, Indices
 
 @dataclass(frozen=True)
 class TorqueCourse:
-    """A joint's torque or force at the motor's shaft over short windows, N m (N).
+    """A joint's torque or force over short windows, as its channel reads it.
 
-    t (W,): middle of each window, s. measured (W,), predicted (W,): mean over it, weighted by its test function. unit:
-    of both.
+    t (W,): middle of each window, s. measured (W,), predicted (W,): mean over it, weighted by its test function, in
+    `unit`.
     """
 
+    channel: str
     unit: str
     t: Array
     measured: Array
@@ -38,7 +39,7 @@ class TorqueCourse:
 
     @property
     def zero(self) -> float:
-        """What the sensor reads too much throughout, N m (N), if the prediction is right."""
+        """What the channel reads too much throughout, in `unit`, if the prediction is right."""
         return float(np.mean(self.measured - self.predicted))
 
     @property
@@ -60,12 +61,14 @@ class TorquePrediction(Observer):
         self._balance = JointBalance(session.model, session.base, self._rate, sensing, gapless=True)
         self._unknowns = [each.unknowns(beta, known) for each in self._balance.state.residuals]
         self._free = np.setdiff1d(np.arange(beta.size), fixed)
-        # A torque at the shaft of 1 N m (N) in the rows.
-        self._unit = self._balance.weight * np.array([joint.gear_ratio for joint in session.system.joints])
+        # Channel of each drive, and what one unit of it is in the rows.
+        self._drives = {
+            i: (channel, self._balance.weight * ratio) for i, (channel, ratio) in session.sensing.drives.items()
+        }
         self._segment = -1
-        self._windows: list[list[tuple[float, float, float]]] = [[] for _ in self._unit]
+        self._windows: dict[int, list[tuple[float, float, float]]] = {i: [] for i in self._drives}
         # Sums over windows of the products of [Y 1 r], joint by joint.
-        self._gram = np.zeros((self._unit.size, self._free.size + 2, self._free.size + 2))
+        self._gram = {i: np.zeros((self._free.size + 2, self._free.size + 2)) for i in self._drives}
 
     def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array, states: Array) -> None:
         """See `Observer`."""
@@ -74,37 +77,40 @@ class TorquePrediction(Observer):
             self._balance.begin_segment()
         for start, rows, measured in self._balance.windows(x, v, np.concatenate((inputs, states), axis=1)):
             middle = (index[0] + start + self._balance.width // 2) / self._rate
-            for i, (row, unknowns, torque) in enumerate(zip(rows, self._unknowns, measured, strict=True)):
-                if np.isfinite(row).all():
-                    error = float(row @ unknowns)
-                    self._windows[i].append((middle, torque / self._unit[i], (torque + error) / self._unit[i]))
-                    columns = np.concatenate((row[self._free], [1.0, error]))
+            for i, (_, unit) in self._drives.items():
+                if np.isfinite(rows[i]).all():
+                    error = float(rows[i] @ self._unknowns[i])
+                    self._windows[i].append((middle, measured[i] / unit, (measured[i] + error) / unit))
+                    columns = np.concatenate((rows[i][self._free], [1.0, error]))
                     self._gram[i] += np.outer(columns, columns)
 
     @property
     def courses(self) -> dict[str, TorqueCourse]:
         """By `joint_i`; those without a torque are left out."""
         system, start, out = self._session.system, self._session.start_time, {}
-        for i, windows in enumerate(self._windows):
+        for i, windows in self._windows.items():
             if windows:
                 t, measured, predicted = np.array(windows).T
                 if measured.any():
-                    unit = channel_unit(system, drive_channel(system, i + 1))
-                    out[joint_rows(i)] = TorqueCourse(unit, start + t, measured, predicted)
+                    channel, _ = self._drives[i]
+                    unit = channel_unit(system, channel)
+                    out[joint_rows(i)] = TorqueCourse(channel, unit, start + t, measured, predicted)
         return out
 
     def least(self) -> dict[str, float]:
         """By joint, the share of its torque that parameters leave which fit the whole run best, beside its zero.
 
-        They fit the torques of all joints, each relative to its own.
+        They fit the torques of all joints, each relative to its own. Empty where there is no torque.
         """
+        if not self.courses:
+            return {}
         left, raw = {}, np.zeros(self._free.size)
         for name, course in self.courses.items():
             i = index_of(name)
             # The mean of a column is what the zero of the torque takes of it.
             gram, count = np.delete(np.delete(self._gram[i], -2, 0), -2, 1), self._gram[i][-2, -2]
             mean = np.delete(self._gram[i][-2], -2) / count
-            signal = float(np.sum((course.measured * self._unit[i]) ** 2))
+            signal = float(np.sum((course.measured * self._drives[i][1]) ** 2))
             left[name] = (gram - count * np.outer(mean, mean)) / signal
             raw += np.diag(gram)[:-1] / signal
         total = np.sum(list(left.values()), axis=0)

@@ -18,7 +18,7 @@ from sms_online.diagnosis.residuals import RowResidual
 from sms_online.effects.catalogue import declares
 from sms_online.errors import InputError
 from sms_online.evaluation import negative
-from sms_online.fixed_residual import FixedResidual, TypeResidual
+from sms_online.fixed_residual import FixedResidual
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -44,6 +44,7 @@ SCHEMA = "sms-online/validation/1"
 HOLDS = 1.15
 # And less than this share of a torque is none.
 NEGLIGIBLE = 0.01
+AS_WELL = "The parameters predict this run as well as those fitted to it"
 # What validation says of parameters: they hold; a torque is mostly noise, and contradicts nothing; they do as well as a
 # fit to the run, which leaves a large share of a torque unexplained; they hold but for the zero of a torque; they
 # differ from those of the run; nothing has them.
@@ -52,20 +53,16 @@ Verdict = Literal["hold", "weak", "unexplained", "shifted", "differ", "impossibl
 
 @dataclass(frozen=True)
 class Predicted:
-    """The prediction error of a joint's torque or force, as a share: rms over rms.
+    """What fixed parameters leave of a force, as a share: rms over rms.
 
-    left: with everything fixed. least: with parameters and a zero of the torque fitted to this run, what the
-    description itself lacks and noise, of which a fit takes some for motion. rows: what is left of the joint's momentum
-    rows over the sensors' noise in them, None where that is not known. zero: what the torque reads too much throughout
-    if the prediction is right, at the shaft, in `unit`; zero_share: its size over rms of the torque.
+    left: with everything fixed. least: fitted to this run, what the description itself lacks and noise, of which a fit
+    takes some for motion. rows: what is left of the momentum rows over the sensors' noise in them, None where that is
+    not known.
     """
 
     left: float
     least: float
     rows: RowResidual | None = None
-    zero: float = 0.0
-    zero_share: float = 0.0
-    unit: str = "N m"
 
     @property
     def ratio(self) -> float:
@@ -73,44 +70,59 @@ class Predicted:
         return self.left / self.least if self.least > 0.0 else np.inf
 
     @property
+    def holds(self) -> bool:
+        """Whether the parameters hold here: fitting them to this run would gain little, or noise alone."""
+        return self._as_fitted(self.left) or (self.rows is not None and not self.rows.beyond)
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether a large share is left that is not noise."""
+        return self.left > NOISE_RESIDUAL and (self.rows is None or self.rows.whitened > NOISE_WHITENED)
+
+    def document(self) -> dict[str, float | str | None]:
+        """The entry of validation.json."""
+        noise = (None, None) if self.rows is None else (self.rows.whitened, self.rows.limit)
+        return {"left": self.left, "least": self.least, "whitened": noise[0], "limit": noise[1]}
+
+    def _as_fitted(self, left: float) -> bool:
+        return left <= max(NEGLIGIBLE, HOLDS * self.least)
+
+
+@dataclass(frozen=True)
+class PredictedTorque(Predicted):
+    """Of a joint's torque or force; a fit to this run is one of parameters and of a zero of each torque.
+
+    zero: what its channel reads too much throughout if the prediction is right, in `unit`; zero_share: its size over
+    rms of the torque.
+    """
+
+    channel: str = ""
+    unit: str = "N m"
+    zero: float = 0.0
+    zero_share: float = 0.0
+
+    @property
     def beside_zero(self) -> float:
         """The share that is left beside a zero of the torque, which each run has its own of."""
         return float(np.sqrt(max(0.0, self.left**2 - self.zero_share**2)))
 
     @property
-    def holds(self) -> bool:
-        """Whether the parameters hold for this joint: fitting them to this run would gain little, or noise alone."""
-        return self._as_fitted(self.left) or (self.rows is not None and not self.rows.beyond)
-
-    @property
     def shifted(self) -> bool:
-        """Whether they hold but for a zero of the torque."""
+        """Whether the parameters hold but for a zero of the torque."""
         return not self.holds and self._as_fitted(self.beside_zero)
-
-    def _as_fitted(self, left: float) -> bool:
-        return left <= max(NEGLIGIBLE, HOLDS * self.least)
 
     @property
     def weak(self) -> bool:
         """Whether most of the torque is left, and is noise: other parameters would do as well."""
         return self.left > LARGEST_RESIDUAL and not self.unexplained
 
-    @property
-    def unexplained(self) -> bool:
-        """Whether a large share of the torque is left that is not noise."""
-        return self.left > NOISE_RESIDUAL and (self.rows is None or self.rows.whitened > NOISE_WHITENED)
-
     def document(self) -> dict[str, float | str | None]:
-        """The entry of validation.json."""
-        noise = (None, None) if self.rows is None else (self.rows.whitened, self.rows.limit)
-        return {
-            "left": self.left,
-            "least": self.least,
-            "zero": self.zero,
+        """See `Predicted`."""
+        return super().document() | {
+            "channel": self.channel,
             "unit": self.unit,
+            "zero": self.zero,
             "beside_zero": self.beside_zero,
-            "whitened": noise[0],
-            "limit": noise[1],
         }
 
 
@@ -121,75 +133,90 @@ class Validation(Tabled):
     system: with which description. duration: of the run, s. joints: `joint_i` to what is left of its torque; those
     without a torque are left out. impossible: why nothing has the parameters, a clause each. diagnosed: whether the
     system is what a diagnosis has found. warnings: of the source, and of a motion beyond what effects are known for.
-    links: `link_i` to what is left of the elastic forces that its deflection makes; empty where shapes are not measured
-    or sensors are too slow. courses: of the joints' torques.
+    deflections: of springs, `joint_i`, and flexible links, `link_i`: what is left of their elastic forces, with these
+    alone fitted for comparison. Empty where shapes are not measured or sensors are too slow; where a stiffness is no
+    parameter it is left out. courses: of the joints' torques. gravity: whether the load of the arm is felt at rest.
     """
 
     system: str
     duration: float
-    joints: Mapping[str, Predicted]
+    joints: Mapping[str, PredictedTorque]
     impossible: tuple[str, ...] = ()
     diagnosed: bool = False
     warnings: tuple[str, ...] = ()
-    links: Mapping[str, TypeResidual] = field(default_factory=dict)
+    deflections: Mapping[str, Predicted] = field(default_factory=dict)
     courses: Mapping[str, TorqueCourse] = field(default_factory=dict)
+    gravity: bool = False
 
     LEFT = 1
 
     @property
     def verdict(self) -> Verdict:
         """What is said of the parameters; the first that applies, from the worst on."""
+        every, shifted = self._every(), [each for each in self.joints.values() if each.shifted]
         if self.impossible:
             return "impossible"
-        differ = [each for each in self.joints.values() if not each.holds]
-        if differ:
-            return "shifted" if all(each.shifted for each in differ) else "differ"
-        if any(each.unexplained for each in self.joints.values()):
+        if any(not each.holds and each not in shifted for each in every.values()):
+            return "differ"
+        if shifted:
+            return "shifted"
+        if any(each.unexplained for each in every.values()):
             return "unexplained"
         return "weak" if any(each.weak for each in self.joints.values()) else "hold"
 
     @property
     def holds(self) -> bool:
-        """Whether the parameters hold on this run too, at every joint, and explain it."""
+        """Whether the parameters hold on this run too, at every joint and link, and explain it."""
         return self.verdict == "hold"
 
     @property
     def sentence(self) -> str:
-        """The verdict, the worst joint and the next step, in a sentence."""
-        verdict, joints = self.verdict, self.joints.items()
+        """The verdict, what it is worst for, and the next step, in a sentence."""
+        verdict = self.verdict
         if verdict == "impossible":
             then = (
                 "see what their diagnosis left unexplained" if self.diagnosed else "diagnose the run that they are from"
             )
             return f"The parameters cannot be, whatever they leave of this run: {'; '.join(self.impossible)}; {then}."
+        every = self._every().items()
         if verdict == "differ":
-            name, worst = max((each for each in joints if not each[1].holds), key=lambda item: item[1].ratio)
-            left = f"{100.0 * worst.left:.2g} % of the torque of {name} is left"
+            name, worst = max((each for each in every if not each[1].holds), key=lambda item: item[1].ratio)
+            left = f"{100.0 * worst.left:.2g} % of the {name} is left"
             ratio = f"{worst.ratio:.3g} times the residual of parameters fitted to it"
             beside = "" if worst.rows is None else f" and {worst.rows.whitened:.3g} times its noise"
             return f"The parameters do not hold on this run: {left}, {ratio}{beside}."
         if verdict == "shifted":
-            shifted = sorted((each for each in joints if each[1].shifted), key=lambda item: -item[1].zero_share)
-            zeros = listed([f"{name}'s by {each.zero:+.2g} {each.unit}" for name, each in shifted])
-            name, worst = shifted[0]
-            share = f"{100.0 * worst.zero_share:.2g} % of the torque of {name}, beside which"
-            return (
-                f"The parameters hold on this run but for the zeros of torques: {zeros} at the shaft, {share} "
-                f"{100.0 * worst.beside_zero:.2g} % is left. Zero the sensors before each run, or declare "
-                f"{declares('drive_offset')}@{name} and fit it."
-            )
+            return self._shifted()
         if verdict == "unexplained":
-            name, worst = max((each for each in joints if each[1].unexplained), key=lambda item: item[1].left)
-            as_well = "The parameters predict this run as well as those fitted to it"
-            left = f"{100.0 * worst.left:.2g} % of the torque of {name} is unexplained in both"
-            return f"{as_well}, but {left}: {DESCRIBE if self.diagnosed else DIAGNOSE}."
-        name, worst = max(joints, key=lambda item: item[1].left)
+            name, worst = max((each for each in every if each[1].unexplained), key=lambda item: item[1].left)
+            left = f"{100.0 * worst.left:.2g} % of the {name} is unexplained in both"
+            return f"{AS_WELL}, but {left}: {DESCRIBE if self.diagnosed else DIAGNOSE}."
+        joint, torque = max(self.joints.items(), key=lambda item: item[1].left)
         if verdict == "weak":
-            noise = f"{100.0 * min(1.0, worst.left):.2g} % of the torque of {name} is noise"
+            noise = f"{100.0 * min(1.0, torque.left):.2g} % of the torque of {joint} is noise"
             return f"The parameters leave no more than noise, but {noise}: {MOVE}."
-        noisy = worst.left > NEGLIGIBLE and worst.rows is not None and not worst.rows.beyond
-        left = f"at most {100.0 * worst.left:.2g} % of a torque is left ({name})"
+        noisy = torque.left > NEGLIGIBLE and torque.rows is not None and not torque.rows.beyond
+        left = f"at most {100.0 * torque.left:.2g} % of a torque is left ({joint})"
         return f"The parameters hold for the torques of this run: {left}{', no more than noise' if noisy else ''}."
+
+    def _every(self) -> dict[str, Predicted]:
+        """All that was predicted, by what it is."""
+        torques = {f"torque of {name}": each for name, each in self.joints.items()}
+        return torques | {f"elastic force of {name}": each for name, each in self.deflections.items()}
+
+    def _shifted(self) -> str:
+        shifted = sorted(self.joints.items(), key=lambda item: -item[1].zero_share)
+        shifted = [each for each in shifted if each[1].shifted]
+        zeros = listed([f"{each.channel} by {each.zero:+.2g} {each.unit}" for _, each in shifted])
+        name, worst = shifted[0]
+        explained = all(each.beside_zero <= NOISE_RESIDUAL for each in self.joints.values())
+        as_well = "The parameters hold on this run" if explained else AS_WELL
+        left = f"{100.0 * worst.zero_share:.2g} % of the torque of {name}, beside which {100.0 * worst.beside_zero:.2g}"
+        load = ", unless the arm carries another load" if self.gravity else ""
+        return (
+            f"{as_well} but for the zeros of torques: {zeros}, {left} % is left. Zero the sensors before each run, or "
+            f"fit {declares('drive_offset')} to each{load}."
+        )
 
     def document(self) -> dict[str, Any]:
         """validation.json as plain dictionaries and numbers."""
@@ -202,31 +229,25 @@ class Validation(Tabled):
             "sentence": self.sentence,
             "impossible": list(self.impossible),
             "joints": {name: each.document() for name, each in self.joints.items()},
-            "links": {
-                name: {"left": each.elastic, "whitened": each.rows.whitened, "limit": each.rows.limit}
-                for name, each in self.links.items()
-            },
+            "deflections": {name: each.document() for name, each in self.deflections.items()},
             "warnings": list(self.warnings),
         }
 
     def rows(self) -> tuple[list[str], list[list[str]]]:
         """Headings and cells of a table."""
-        cells = [
-            [
-                name,
-                *(f"{share:.3g}" for share in (each.left, each.beside_zero, each.least)),
-                f"{each.ratio:.2f}",
-                "" if each.rows is None else f"{each.rows.whitened:.3g}",
-            ]
-            for name, each in self.joints.items()
-        ]
+        cells = [_cells(name, e, e.left, e.beside_zero, e.least) for name, e in self.joints.items()]
         left = ["share of torque left", "beside its zero", "fitted to this run"]
         return ["joint", *left, "ratio", "times noise"], cells
 
-    def link_rows(self) -> tuple[list[str], list[list[str]]]:
-        """Headings and cells of a table of the links."""
-        cells = [[name, f"{each.elastic:.3g}", f"{each.rows.whitened:.3g}"] for name, each in self.links.items()]
-        return ["link", "share of elastic force left", "times noise"], cells
+    def deflection_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Headings and cells of a table of springs and flexible links."""
+        cells = [_cells(name, e, e.left, e.least) for name, e in self.deflections.items()]
+        return ["deflection", "share of elastic force left", "fitted to this run", "ratio", "times noise"], cells
+
+
+def _cells(name: str, each: Predicted, *shares: float) -> list[str]:
+    noise = "" if each.rows is None else f"{each.rows.whitened:.3g}"
+    return [name, *(f"{share:.3g}" for share in shares), f"{each.ratio:.2f}", noise]
 
 
 def validate(
@@ -269,17 +290,27 @@ def validate(
     courses, least = prediction.courses, prediction.least()
     if not courses:
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
-    left = {} if residual is None else residual.by_type(beta, gains)
+    by_type, elastic = ({}, {}) if residual is None else residual.of(beta, gains)
     joints = {
-        name: Predicted(
-            each.left, least[name], left[name].rows if left else None, each.zero, each.zero_share, each.unit
+        name: PredictedTorque(
+            each.left, least[name], by_type.get(name), each.channel, each.unit, each.zero, each.zero_share
         )
         for name, each in courses.items()
     }
-    links = {name: each for name, each in left.items() if name.startswith("link_") and each.elastic is not None}
+    deflections = {name: Predicted(each.left, each.least, each.rows) for name, each in elastic.items()}
     warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
     cannot = _impossible(session.model, session.base, beta, parameters)
-    return Validation(system.name, session.duration, joints, cannot, bool(system.fitted), warnings, links, courses)
+    return Validation(
+        system.name,
+        session.duration,
+        joints,
+        cannot,
+        bool(system.fitted),
+        warnings,
+        deflections,
+        courses,
+        any(system.gravity),
+    )
 
 
 def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:

@@ -306,8 +306,13 @@ class Attempt(Hypothesis):
         )
         return CandidateColumns(rows, self.make.system)
 
-    def joints_elsewhere(self) -> RelativeResiduals:
-        """Rows of the joints' torques in the capture that is held out, of all its samples."""
+    def joints_elsewhere(self) -> RelativeResiduals | None:
+        """Rows of the joints' torques, in windows that overlap by half, of the capture that is held out.
+
+        None without one, or where it is too short.
+        """
+        if not self._held:
+            return None
         make = self._made_elsewhere()
         return RelativeResiduals(make.rows, make, gapless=True)
 

@@ -84,10 +84,13 @@ class Calibrated:
         return np.array([any(_replaces(effect, each) for effect in effects) for each in self.nuisances], dtype=np.bool_)
 
     def tolerates(self, constant: Effect) -> bool:
-        """Whether a zero or an eccentricity is no more than what is tolerated of a sensor anyway."""
+        """Whether a zero or an eccentricity is no more than what is tolerated of a position sensor anyway."""
+        if ENTRIES[constant.name].kind != "channel":
+            return False
         own = [each.tolerance for each in self.nuisances if _replaces(constant, each) and each.name != "clock"]
-        # Its first coefficient is its size in their unit.
-        return bool(own) and abs(next(iter(constant.coefficients.values()))) <= LIMIT * max(own)
+        # A channel's effect is declared by its size first, in the unit of the channel.
+        size = constant.coefficients[next(iter(ENTRIES[constant.name].coefficients))]
+        return bool(own) and abs(size) <= LIMIT * max(own)
 
     def beyond(self, values: Array) -> Mask:
         """Which of them (m,) an effect of the catalogue has to replace, for estimates (m,)."""

@@ -26,7 +26,7 @@ from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord
 from sms_online.diagnosis.search import Search
-from sms_online.diagnosis.torque_zeros import HELD_OUT, torque_zeros, without_zeros
+from sms_online.diagnosis.torque_zeros import HELD_OUT, TorqueZero, torque_zeros, without_zeros
 from sms_online.diagnosis.unexplained import describe_residual
 from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import kinematic_candidates
@@ -103,7 +103,7 @@ def diagnose(
         followed, _ = _session(following(system), runs, source, prior)
     drifts = explained_by_drifts(followed)
     if drifts:
-        return _drifting(case, followed, drifts, mistakes)
+        return _drifting(case, followed, drifts, mistakes, zeros)
     late: list[LateSensor] = []
     while (_explains_little(before) or attempt.tracing.exceeds) and (found := find_late(attempt.rows)):
         progress("taking off a sensor's lag", TRACED)
@@ -229,7 +229,13 @@ def _check_unchanged(session: Estimator, source: str) -> None:
         raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
 
 
-def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistakes: tuple[Mistake, ...]) -> Search:
+def _drifting(
+    case: Case,
+    followed: Estimator,
+    drifts: tuple[Drift, ...],
+    mistakes: tuple[Mistake, ...],
+    zeros: Sequence[TorqueZero],
+) -> Search:
     """What a session that follows drifts has found; residuals after are of its rows, with the drift taken off."""
     before = case.session
     attempt = Attempt(case, before.system, candidates=())
@@ -243,6 +249,7 @@ def _drifting(case: Case, followed: Estimator, drifts: tuple[Drift, ...], mistak
         verdict="named",
         partial=False,
         mistakes=mistakes,
+        zeros=zeros,
         calibration=(),
         findings=[],
         late=[],

@@ -21,7 +21,7 @@ class RelativeResiduals:
     """Rows of the joints over the session, of a model and of effects beside it.
 
     times (W,): the windows' middles, s since grid index 0. segment (W,): numbers of the segments that hold them.
-    measured (W, joints): torques or forces. unit (joints,): one N m (N) at the motor's shaft, in rows.
+    measured (W, joints): torques or forces. weight: ∫ φ dt of a window, s.
     """
 
     def __init__(self, rows: SessionRows, make: CandidateColumns, gapless: bool = False) -> None:
@@ -48,7 +48,7 @@ class RelativeResiduals:
         joints = len(layout.q)
         torque = -weak.columns(lambda motion: (None, motion.torque[:, :joints, None]))[..., 0]
         one = -weak.columns(lambda motion: (None, np.ones((len(motion.x), joints, 1))))[..., 0]
-        self.unit = one.mean(axis=0) * [joint.gear_ratio for joint in rows.model.system.joints]
+        self.weight = float(one.mean())
         self.measured = torque
         self._b = torque - rows.base.known_part(physical)
         self._effects: list[Array] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,12 +37,13 @@ class RowResidual:
 class ResidualTest:
     """Tests residuals (W, n_v), each row over its own predicted deviation, against noise alone.
 
+    types: speeds by name; those of the row types unless given.
     Mean squares of rows that share noise have fewer degrees of freedom than there are rows (Satterthwaite, Biometrics
     Bulletin 2 (1946) 110).
     """
 
-    def __init__(self, rows: SessionRows) -> None:
-        self.types = row_types(rows.model.layout)
+    def __init__(self, rows: SessionRows, types: Mapping[str, list[int]] | None = None) -> None:
+        self.types = row_types(rows.model.layout) if types is None else types
         freedom = {name: rows.freedom(speeds) for name, speeds in self.types.items()}
         level = FALSE_ALARM / len(self.types)
         self.limit = {

@@ -40,6 +40,7 @@ class Search:
     verdict: str
     partial: bool
     mistakes: tuple[Mistake, ...]
+    zeros: Sequence[TorqueZero]
     calibration: tuple[Calibration, ...]
     findings: list[Finding]
     late: list[LateSensor]
@@ -54,7 +55,6 @@ class Search:
     estimator_after: Estimator
     unexplained: Unexplained | None
     drifts: tuple[Drift, ...] = ()
-    zeros: Sequence[TorqueZero] = ()
 
     @property
     def left(self) -> float:

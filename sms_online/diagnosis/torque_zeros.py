@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import t as student_t
 
-from sms_online.description.channels import channel_unit, drive_channel
+from sms_online.description.channels import channel_unit
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt
 from sms_online.diagnosis.constants import is_constant
@@ -19,12 +20,14 @@ from sms_online.diagnosis.evidence import RANK_TOLERANCE
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.stream import Array, Block, Indices
 
-# A zero is taken off where it is this share of the rms of its torque, and this many of its deviations.
-LEAST_SHARE, LEAST_DEVIATIONS = 0.01, 4.0
+# A zero is taken off where it is this share of the rms of its torque, and no chance but with this probability.
+LEAST_SHARE, FALSE_ALARM = 0.01, 1e-3
 # Rows for each effect, to try all its shapes.
 ROWS_EACH = 10
-# Stretches whose sums give the deviation of a mean: what is left is correlated.
-STRETCHES = 20
+# What is left is correlated over a while, so that stretches of a capture are left out at once, of so many windows.
+LEAST_WINDOWS = 10
+# Of a capture, at least and at most.
+LEAST_STRETCHES, MOST_STRETCHES = 5, 20
 # Number of the capture that is held out.
 HELD_OUT = -1
 
@@ -33,8 +36,8 @@ HELD_OUT = -1
 class TorqueZero:
     """What a joint's torque or force reads more in a capture than in the first.
 
-    channel: of the drive. capture: its number, that of the one held out is HELD_OUT. offset, std: at the motor's shaft,
-    in `unit`. gravity: whether another load of the arm would show as such a zero.
+    channel: of the drive. capture: its number, that of the one held out is HELD_OUT. offset, std: of the channel, in
+    `unit`. gravity: whether another load of the arm would show as such a zero.
     """
 
     channel: str
@@ -49,34 +52,39 @@ class TorqueZero:
         """In words, with captures counted from 1."""
         where = "the capture held out" if self.capture == HELD_OUT else f"capture {self.capture + 1}"
         size = f"{abs(self.offset):.2g} ± {self.std:.1g} {self.unit} {'more' if self.offset > 0.0 else 'less'}"
-        load = "; where its zero is the same, the arm carries another load" if self.gravity else ""
-        return f"{self.channel} reads {size} in {where} than in the first, which was taken off{load}"
+        load = ", or the arm carries another load there" if self.gravity else ""
+        return f"{self.channel} reads {size} in {where} than in the first{load}; it was taken off"
 
 
 def torque_zeros(attempt: Attempt) -> list[TorqueZero]:
-    """Zeros of captures after the first, and of the one held out, that differ from those of the first."""
+    """Zeros of captures after the first, and of the one held out, that differ from those of the first.
+
+    None where the first is too short to be compared with.
+    """
     losses = [
         each.effect
         for each in attempt.tracing.candidates
         if each.effect.where.startswith("joint_")
         and not (each.traits.signed or each.traits.learned or is_constant(each.effect))
     ]
-    joints, system, n = RelativeResiduals(attempt.rows, attempt.make, gapless=True), attempt.system, attempt.rows.base.n
-    joints.declare(_few(losses, joints.measured.size))
-    described = attempt.solution([])
-    solution = np.concatenate((described[:n], np.zeros(joints.columns.shape[2] - n), described[n:]))
-    fit = _Fit(joints, solution, np.searchsorted(attempt.case.begins, joints.times))
-    others = [(k, *fit.against_first(k)) for k in fit.captures[1:]]
-    if attempt.case.held:
-        elsewhere = attempt.joints_elsewhere()
-        elsewhere.declare(_few(losses, joints.measured.size))
-        others.append((HELD_OUT, *fit.elsewhere(elsewhere)))
-    out = []
-    for capture, offset, std, size in others:
-        for i in np.flatnonzero(np.abs(offset) > np.maximum(LEAST_SHARE * size, LEAST_DEVIATIONS * std)):
-            channel = drive_channel(system, int(i) + 1)
-            unit, gravity = channel_unit(system, channel), any(system.gravity)
-            out.append(TorqueZero(channel, capture, float(offset[i]), float(std[i]), unit, gravity))
+    joints, elsewhere = RelativeResiduals(attempt.rows, attempt.make, gapless=True), attempt.joints_elsewhere()
+    tried = _few(losses, joints.measured.size)
+    joints.declare(tried)
+    if elsewhere is not None:
+        elsewhere.declare(tried)
+    n, described = attempt.rows.base.n, attempt.solution([])
+    described = np.concatenate((described[:n], np.zeros(joints.columns.shape[2] - n), described[n:]))
+    offsets = _Offsets(joints, elsewhere, described, np.searchsorted(attempt.case.begins, joints.times))
+    sensing, system, out = attempt.rows.sensing, attempt.system, []
+    for capture in offsets.comparable:
+        offset, std, size = offsets.against_first(capture)
+        # Few stretches give a deviation that is uncertain itself.
+        most = float(student_t.isf(0.5 * FALSE_ALARM, offsets.freedom(capture)))
+        for i, (channel, ratio) in sensing.drives.items():
+            if abs(offset[i]) > max(LEAST_SHARE * size[i], most * std[i]) and size[i] > 0.0:
+                value, deviation = (float(each[i]) / (joints.weight * ratio) for each in (offset, std))
+                unit = channel_unit(system, channel)
+                out.append(TorqueZero(channel, capture, value, deviation, unit, any(system.gravity)))
     return out
 
 
@@ -87,82 +95,111 @@ def _few(effects: Sequence[Effect], rows: int) -> list[Effect]:
     return list({each.key: each for each in reversed(effects)}.values())
 
 
-class _Fit:
-    """Model and effects declared, fitted to the torques of all captures, each with a zero of its own.
+class _Offsets:
+    """What model and effects declared leave of the torques in the mean over each capture, and its deviation.
 
-    solution (n + c + m,): to begin with. capture (W,): number of each window's. Joints count relative to their own
-    torques.
+    They are fitted to all captures but the one held out, `elsewhere`, each with an offset of its own. described (n + c
+    + m,): a solution to begin with. capture (W,): number of each window's. Joints count relative to their own torques.
+    Deviations are those of the jackknife: one stretch after the other is left out of the fit.
     """
 
-    def __init__(self, joints: RelativeResiduals, solution: Array, capture: Indices) -> None:
-        self._joints, self._solution, self._capture = joints, solution.copy(), capture
-        columns, left = joints.columns, joints.left(solution)
+    def __init__(
+        self, joints: RelativeResiduals, elsewhere: RelativeResiduals | None, described: Array, capture: Indices
+    ) -> None:
         size = np.linalg.norm(joints.measured, axis=0)
-        self._weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
-        A = columns * self._weight[:, None]
-        raw = np.linalg.norm(A, axis=(0, 1))
-        # Those too short for a window have none.
-        self._captures = {k: capture == k for k in np.unique(capture).tolist()}
-        for own in self._captures.values():
-            A[own] -= A[own].mean(axis=0)
-        norm = np.linalg.norm(A, axis=(0, 1))
-        # Of a column that is a zero itself only rounding is left.
-        self._varies = np.flatnonzero(norm > RANK_TOLERANCE * raw)
-        scaled = A[..., self._varies].reshape(-1, self._varies.size) / norm[self._varies]
-        # Change of the solution by the rows' errors, (c, W, joints).
-        change = np.linalg.pinv(scaled, rcond=RANK_TOLERANCE) / norm[self._varies, None]
-        self._change = change.reshape(-1, *left.shape) * self._weight
-        self._solution[self._varies] += np.tensordot(self._change, left, 2)
-        rest = joints.left(self._solution)
-        self._zero = {k: rest[own].mean(axis=0) for k, own in self._captures.items()}
-        for k, own in self._captures.items():
-            rest[own] -= self._zero[k]
-        spare = max(1, left.size - self._varies.size - len(self._zero) * size.size)
-        self._rest = rest * np.sqrt(left.size / spare)
+        weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+        columns, left = joints.columns, joints.left(described)
+        self._parts = {
+            k: _Part(columns[own], left[own], joints.measured[own], weight)
+            for k in np.unique(capture).tolist()
+            if np.any(own := capture == k)
+        }
+        self._fitted = list(self._parts)
+        if elsewhere is not None:
+            self._parts[HELD_OUT] = _Part(elsewhere.columns, elsewhere.left(described), elsewhere.measured, weight)
+        self._offset = self._means()
+        self._without = {
+            k: [self._means(k, number) for number in range(len(part.stretches))] for k, part in self._parts.items()
+        }
 
     @property
-    def captures(self) -> list[int]:
-        """Numbers of those that were fitted."""
-        return list(self._captures)
+    def comparable(self) -> list[int]:
+        """Captures that are long enough, none where the first is not."""
+        long = [k for k, part in self._parts.items() if len(part.stretches) >= LEAST_STRETCHES]
+        return [k for k in long if k != 0] if 0 in long else []
 
-    def against_first(self, k: int) -> tuple[Array, Array, Array]:
-        """What torques at the shaft read more in a capture than in the first, its deviation, and the torque's rms."""
-        own = self._captures[k]
-        mean = self._joints.columns[own].mean(axis=0)
-        errors = np.where(own[:, None], self._rest / own.sum(), 0.0)
-        variance = self._variance(mean, errors)
-        return self._at_shaft(self._zero[k], variance, self._joints.measured[own])
+    def freedom(self, capture: int) -> int:
+        """Degrees of freedom of the deviation of a capture's offset, at least."""
+        return min(len(self._parts[k].stretches) for k in (0, capture)) - 1
 
-    def elsewhere(self, joints: RelativeResiduals) -> tuple[Array, Array, Array]:
-        """The same of a capture that was not fitted."""
-        rest = joints.left(self._solution)
-        zero = rest.mean(axis=0)
-        variance = self._variance(joints.columns.mean(axis=0), np.zeros_like(self._rest))
-        variance += _of_sum((rest - zero) / len(rest))
-        return self._at_shaft(zero, variance, joints.measured)
+    def against_first(self, capture: int) -> tuple[Array, Array, Array]:
+        """An offset in the rows against that of the first, its deviation, and the torque's rms, (joints,) each."""
+        variance = np.zeros_like(self._offset[capture])
+        for without in self._without.values():
+            if len(without) > 1:
+                each = np.array([means[capture] - means[0] for means in without])
+                variance += (len(each) - 1) ** 2 / len(each) * each.var(axis=0, ddof=1)
+        return self._offset[capture] - self._offset[0], np.sqrt(variance), self._parts[capture].size
 
-    def _variance(self, mean: Array, errors: Array) -> Array:
-        """Variance (joints,) of a zero against the first's.
-
-        mean (joints, n + c): of the columns in its capture. errors (W, joints): its own.
-        """
-        first = self._captures[self.captures[0]]
-        errors = errors - np.where(first[:, None], self._rest / first.sum(), 0.0)
-        difference = (mean - self._joints.columns[first].mean(axis=0))[:, self._varies]
-        # Rows of all joints change the solution, and with it the mean of each.
-        by_rows = np.einsum("cwj,wj->wc", self._change, self._rest)
-        return _of_sum(errors - by_rows @ difference.T)
-
-    def _at_shaft(self, zero: Array, variance: Array, measured: Array) -> tuple[Array, Array, Array]:
-        unit = self._joints.unit
-        size = np.sqrt(np.mean(measured**2, axis=0)) / unit
-        return (zero - self._zero[self.captures[0]]) / unit, np.sqrt(variance) / unit, size
+    def _means(self, capture: int | None = None, stretch: int | None = None) -> dict[int, Array]:
+        """What is left in the mean over each capture (joints,), without a stretch of one."""
+        kept = {k: part.without(stretch if k == capture else None) for k, part in self._parts.items()}
+        gram = np.sum([kept[k].centred for k in self._fitted], axis=0)
+        raw = np.sum([np.diag(kept[k].gram) for k in self._fitted], axis=0)[:-1]
+        # Of a column that is an offset itself only rounding is left.
+        varies = np.flatnonzero(np.diag(gram)[:-1] > RANK_TOLERANCE * raw)
+        norm = np.sqrt(np.diag(gram)[varies])
+        scaled = gram[np.ix_(varies, varies)] / np.outer(norm, norm)
+        change = np.append(np.zeros(len(gram) - 1), -1.0)
+        change[varies] = np.linalg.lstsq(scaled, gram[varies, -1] / norm, rcond=RANK_TOLERANCE)[0] / norm
+        return {k: -each.mean @ change for k, each in kept.items()}
 
 
-def _of_sum(errors: Array) -> Array:
-    """Variance (joints,) of the sum of errors (W, joints) that are correlated over a while."""
-    sums = [part.sum(axis=0) for part in np.array_split(errors, min(STRETCHES, len(errors)))]
-    return np.asarray(np.sum(np.square(sums), axis=0))
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over windows of the rows [columns left] (n + c + 1) of each joint.
+
+    gram: of their products, joints by their weights. total (joints, n + c + 1). weight (joints,). count: of windows.
+    """
+
+    gram: Array
+    total: Array
+    weight: Array
+    count: int
+
+    @property
+    def mean(self) -> Array:
+        """Of the rows of each joint, (joints, n + c + 1)."""
+        return self.total / self.count
+
+    @property
+    def centred(self) -> Array:
+        """The products of rows without their means."""
+        weighted = self.mean * self.weight[:, None]
+        return np.asarray(self.gram - self.count * weighted.T @ weighted)
+
+
+class _Part:
+    """A capture, in stretches: columns (W, joints, n + c), what a solution leaves of them, torques (W, joints)."""
+
+    def __init__(self, columns: Array, left: Array, measured: Array, weight: Array) -> None:
+        rows = np.concatenate((columns, left[..., None]), axis=2)
+        self.size = np.sqrt(np.mean(measured**2, axis=0))
+        count = max(1, min(MOST_STRETCHES, len(rows) // LEAST_WINDOWS))
+        self.stretches = []
+        for each in np.array_split(rows, count):
+            weighted = (each * weight[:, None]).reshape(-1, rows.shape[2])
+            self.stretches.append(_Sums(weighted.T @ weighted, each.sum(axis=0), weight, len(each)))
+
+    def without(self, stretch: int | None) -> _Sums:
+        """The sums of all stretches but one."""
+        kept = [each for number, each in enumerate(self.stretches) if number != stretch] or self.stretches
+        return _Sums(
+            np.sum([each.gram for each in kept], axis=0),
+            np.sum([each.total for each in kept], axis=0),
+            kept[0].weight,
+            sum(each.count for each in kept),
+        )
 
 
 def without_zeros(blocks: Sequence[Block], zeros: Sequence[TorqueZero], capture: int) -> list[Block]:

@@ -256,6 +256,12 @@ class Sensing:
                 self.model.chain.elastic(x, i)[:] = elastic
         return x
 
+    @property
+    def drives(self) -> dict[int, tuple[str, float]]:
+        """Channel of each joint's drive, by the joint's number from 0, and n of the torque after the gear n τ."""
+        channels = [self.channels[column] for column in self.torque_columns]
+        return dict(zip(self._driven, zip(channels, self._ratio.tolist(), strict=True), strict=True))
+
     def motion(self, values: Array) -> Array:
         """x and signals side by side (B, n_x + n_signals) of samples (B, channels + n_states)."""
         return np.concatenate((self.coordinates(values), self.signals(values)), axis=1)

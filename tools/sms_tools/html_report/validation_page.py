@@ -29,13 +29,13 @@ def write_validation(directory: Path, found: Validation) -> Path:
         "validation.html",
         title=f"{found.system}: {found.duration:.0f} s predicted with fixed parameters",
         found=found,
-        tables=[table for table in (found.rows(), found.link_rows()) if table[1]],
+        tables=[table for table in (found.rows(), found.deflection_rows()) if table[1]],
         part=PART,
-        charts=[part for name, course in found.courses.items() for part in (_part(name, course), _run(name, course))],
+        charts=[part for course in found.courses.values() for part in (_part(course), _run(course))],
     )
 
 
-def _part(name: str, course: TorqueCourse) -> Chart:
+def _part(course: TorqueCourse) -> Chart:
     """Measured and predicted torque and the error, in the part of the run where this is largest."""
     # Of each window, the error from there on for the length of a part.
     error = np.concatenate(([0.0], np.cumsum((course.predicted - course.measured) ** 2)))
@@ -50,7 +50,7 @@ def _part(name: str, course: TorqueCourse) -> Chart:
         ("left", (course.measured - course.predicted)[some], LEFT),
     )
     series = [Series(label, *_broken(t, values), color=color) for label, values, color in lines]
-    return chart(f"{name}, {course.unit} at the shaft", series, TIME)
+    return chart(f"{course.channel}, {course.unit}", series, TIME)
 
 
 def _broken(t: Array, values: Array) -> tuple[Array, Array]:
@@ -60,7 +60,7 @@ def _broken(t: Array, values: Array) -> tuple[Array, Array]:
     return np.insert(t, gaps, t[gaps]), np.insert(values, gaps, np.nan)
 
 
-def _run(name: str, course: TorqueCourse) -> Chart:
+def _run(course: TorqueCourse) -> Chart:
     """rms of the torque and of the error over the whole run."""
     parts = np.array_split(np.arange(course.t.size), min(STRETCHES, course.t.size))
     t = np.array([course.t[part].mean() for part in parts])
@@ -69,4 +69,4 @@ def _run(name: str, course: TorqueCourse) -> Chart:
         Series(label, t, np.array([rms(values[part]) for part in parts]), color=color)
         for label, values, color in (("measured", course.measured, MEASURED), ("left", error, LEFT))
     ]
-    return chart(f"{name}, rms over the run, {course.unit}", series, TIME)
+    return chart(f"{course.channel}, rms over the run, {course.unit}", series, TIME)

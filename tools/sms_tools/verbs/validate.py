@@ -36,8 +36,8 @@ def run(args: argparse.Namespace) -> int:
 
     page = write_validation(directory, found)
     tables: list[Table | str] = [table(*found.rows(), left=("joint",)), ""]
-    if found.links:
-        tables += [table(*found.link_rows(), left=("link",)), ""]
+    if found.deflections:
+        tables += [table(*found.deflection_rows(), left=("deflection",)), ""]
     warnings = [f"warning: {warning}" for warning in found.warnings]
     files = [f"validation: {path}", f"page: {page}"]
     say(args, *tables, *warnings, *files, "", found.sentence, document=found.to_json())
