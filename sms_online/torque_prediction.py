@@ -9,7 +9,7 @@ import numpy as np
 
 from sms_online.description.channels import channel_unit
 from sms_online.description.tree import index_of
-from sms_online.diagnosis.evidence import RANK_TOLERANCE
+from sms_online.diagnosis.evidence import solution_of
 from sms_online.diagnosis.residuals import rms
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.joint_balance import JointBalance
@@ -114,12 +114,6 @@ class TorquePrediction(Observer):
             left[name] = (gram - count * np.outer(mean, mean)) / signal
             raw += np.diag(gram)[:-1] / signal
         total = np.sum(list(left.values()), axis=0)
-        squares = np.diag(total)[:-1]
-        # Of a column that is a zero itself only rounding is left.
-        varies = np.flatnonzero(squares > RANK_TOLERANCE * raw)
-        size = np.sqrt(squares[varies])
-        scaled = total[np.ix_(varies, varies)] / np.outer(size, size)
-        change = np.zeros(self._free.size)
-        change[varies] = np.linalg.lstsq(scaled, -total[varies, -1] / size, rcond=RANK_TOLERANCE)[0] / size
-        w = np.append(change, 1.0)
+        # A column that is a zero itself leaves nothing.
+        w = np.append(-solution_of(total, raw), 1.0)
         return {name: float(np.sqrt(max(0.0, w @ gram @ w))) for name, gram in left.items()}

@@ -38,6 +38,21 @@ def basis(columns: Array) -> Array:
     return np.asarray(U[:, s > RANK_TOLERANCE * s[0]])
 
 
+def solution_of(gram: Array, raw: Array) -> Array:
+    """Least squares (c,) of columns whose products with each other and with b, last, are gram (c + 1, c + 1).
+
+    raw (c,): squares of the columns before their means, or what else they have in common, were taken off. A column of
+    which only rounding is left has zero.
+    """
+    squares = np.diag(gram)[:-1]
+    varies = np.flatnonzero(squares > RANK_TOLERANCE * raw)
+    size = np.sqrt(squares[varies])
+    scaled = gram[np.ix_(varies, varies)] / np.outer(size, size)
+    out = np.zeros(squares.size)
+    out[varies] = np.linalg.lstsq(scaled, gram[varies, -1] / size, rcond=RANK_TOLERANCE)[0] / size
+    return out
+
+
 def free_of(Q: Array, columns: Array) -> Array:
     """What of columns (M, c) is orthogonal to the basis Q (M, rank)."""
     free = np.asarray(columns - Q @ (Q.T @ columns))

@@ -16,7 +16,7 @@ from sms_online.description.channels import channel_unit
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.attempt import Attempt
 from sms_online.diagnosis.constants import is_constant
-from sms_online.diagnosis.evidence import RANK_TOLERANCE
+from sms_online.diagnosis.evidence import solution_of
 from sms_online.diagnosis.relative import RelativeResiduals
 from sms_online.stream import Array, Block, Indices
 
@@ -146,12 +146,8 @@ class _Offsets:
         kept = {k: part.without(stretch if k == capture else None) for k, part in self._parts.items()}
         gram = np.sum([kept[k].centred for k in self._fitted], axis=0)
         raw = np.sum([np.diag(kept[k].gram) for k in self._fitted], axis=0)[:-1]
-        # Of a column that is an offset itself only rounding is left.
-        varies = np.flatnonzero(np.diag(gram)[:-1] > RANK_TOLERANCE * raw)
-        norm = np.sqrt(np.diag(gram)[varies])
-        scaled = gram[np.ix_(varies, varies)] / np.outer(norm, norm)
-        change = np.append(np.zeros(len(gram) - 1), -1.0)
-        change[varies] = np.linalg.lstsq(scaled, gram[varies, -1] / norm, rcond=RANK_TOLERANCE)[0] / norm
+        # A column that is an offset itself leaves nothing.
+        change = np.append(solution_of(gram, raw), -1.0)
         return {k: -each.mean @ change for k, each in kept.items()}
 
 
