@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,28 +12,14 @@ from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import SampleRecord, bounded, excerpts
 from sms_online.diagnosis.residuals import ResidualTest, RowResidual, rms
 from sms_online.diagnosis.rows import SessionRows
+from sms_online.model.parameters import ELASTIC
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.relinearisation import NOISE_RENEWED, PASS_BAND
 from sms_online.pipeline.sensing import is_slow, stated_period
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
 from sms_online.pipeline.torque_gains import GAIN
+from sms_online.predicted import Predicted
 from sms_online.stream import Array, Block
-
-# Ends of the names of the parameters whose forces grow with a deflection.
-ELASTIC = ("stiffness", "rigidity", "rigidity_y", "rigidity_z")
-
-
-@dataclass(frozen=True)
-class ElasticResidual:
-    """What is left of the rows of a joint's spring or of a link's deflection, as a share of its elastic force.
-
-    left: with everything fixed. least: with its own stiffness or rigidities fitted to the run. rows: over noise. All
-    are root mean squares of rows in units of their noise.
-    """
-
-    left: float
-    least: float
-    rows: RowResidual
 
 
 class FixedResidual:
@@ -68,7 +53,7 @@ class FixedResidual:
             self._renewed = float(block.t[-1])
             self._noise = self._estimate.noise(self._session.periods, self._system)
 
-    def of(self, beta: Array, gains: Mapping[str, float]) -> tuple[dict[str, RowResidual], dict[str, ElasticResidual]]:
+    def of(self, beta: Array, gains: Mapping[str, float]) -> tuple[dict[str, RowResidual], dict[str, Predicted]]:
         """What parameters β (n,) leave by row type, and by spring and flexible link.
 
         Both are empty where there are too few samples, or noise has no effect; springs and links whose stiffness is no
@@ -92,7 +77,11 @@ class FixedResidual:
         return ResidualTest(rows).of(residual), _elastic(rows, beta, residual)
 
 
-def _elastic(rows: SessionRows, beta: Array, residual: Array) -> dict[str, ElasticResidual]:
+def _elastic(rows: SessionRows, beta: Array, residual: Array) -> dict[str, Predicted]:
+    """What is left of elastic forces, root mean squares of rows in units of their noise.
+
+    The least is with the place's own stiffness or rigidities fitted to the run.
+    """
     layout = rows.model.layout
     joints = enumerate(zip(layout.q, layout.theta_m, strict=True), start=1)
     springs = {f"joint_{i}": [q] for i, (q, theta_m) in joints if q != theta_m}
@@ -112,5 +101,5 @@ def _elastic(rows: SessionRows, beta: Array, residual: Array) -> dict[str, Elast
         force, left = columns @ beta[own], residual[:, speeds].ravel()
         if np.any(force):
             fitted = left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
-            out[place] = ElasticResidual(rms(left) / rms(force), rms(fitted) / rms(force), tested[place])
+            out[place] = Predicted(rms(left) / rms(force), rms(fitted) / rms(force), tested[place])
     return out

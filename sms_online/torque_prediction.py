@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +67,7 @@ class TorquePrediction(Observer):
         }
         self._segment = -1
         self._windows: dict[int, list[tuple[float, float, float]]] = {i: [] for i in self._drives}
-        # Sums over windows of the products of [Y 1 r], joint by joint.
+        # Sums over windows of the products of [Y r 1], joint by joint.
         self._gram = {i: np.zeros((self._free.size + 2, self._free.size + 2)) for i in self._drives}
 
     def motion(self, index: Indices, segment: int, x: Array, v: Array, inputs: Array, states: Array) -> None:
@@ -81,7 +81,7 @@ class TorquePrediction(Observer):
                 if np.isfinite(rows[i]).all():
                     error = float(rows[i] @ self._unknowns[i])
                     self._windows[i].append((middle, measured[i] / unit, (measured[i] + error) / unit))
-                    columns = np.concatenate((rows[i][self._free], [1.0, error]))
+                    columns = np.concatenate((rows[i][self._free], [error, 1.0]))
                     self._gram[i] += np.outer(columns, columns)
 
     @property
@@ -97,23 +97,18 @@ class TorquePrediction(Observer):
                     out[joint_rows(i)] = TorqueCourse(channel, unit, start + t, measured, predicted)
         return out
 
-    def least(self) -> dict[str, float]:
+    def least(self, courses: Mapping[str, TorqueCourse]) -> dict[str, float]:
         """By joint, the share of its torque that parameters leave which fit the whole run best, beside its zero.
 
-        They fit the torques of all joints, each relative to its own. Empty where there is no torque.
+        They fit the torques of all joints that have a course, each relative to its own.
         """
-        if not self.courses:
-            return {}
         left, raw = {}, np.zeros(self._free.size)
-        for name, course in self.courses.items():
+        for name, course in courses.items():
             i = index_of(name)
-            # The mean of a column is what the zero of the torque takes of it.
-            gram, count = np.delete(np.delete(self._gram[i], -2, 0), -2, 1), self._gram[i][-2, -2]
-            mean = np.delete(self._gram[i][-2], -2) / count
             signal = float(np.sum((course.measured * self._drives[i][1]) ** 2))
-            left[name] = (gram - count * np.outer(mean, mean)) / signal
+            # What columns have in the mean is what the zero of the torque takes of them.
+            gram, sums, count = self._gram[i][:-1, :-1], self._gram[i][-1, :-1], self._gram[i][-1, -1]
+            left[name] = (gram - np.outer(sums, sums) / count) / signal
             raw += np.diag(gram)[:-1] / signal
-        total = np.sum(list(left.values()), axis=0)
-        # A column that is a zero itself leaves nothing.
-        w = np.append(-solution_of(total, raw), 1.0)
+        w = np.append(-solution_of(np.sum(list(left.values()), axis=0), raw), 1.0)
         return {name: float(np.sqrt(max(0.0, w @ gram @ w))) for name, gram in left.items()}

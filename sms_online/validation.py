@@ -14,7 +14,6 @@ from sms_online.cramer_rao import MotionRecord
 from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.schema import System
-from sms_online.diagnosis.residuals import RowResidual
 from sms_online.effects.catalogue import declares
 from sms_online.errors import InputError
 from sms_online.evaluation import negative
@@ -25,8 +24,8 @@ from sms_online.model.model import Model
 from sms_online.physical import PhysicalSet
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.torque_gains import GAIN, gain_columns
+from sms_online.predicted import NEGLIGIBLE, Predicted, PredictedTorque
 from sms_online.result import Parameter, Parameters, Result
-from sms_online.row_types import LARGEST_RESIDUAL, NOISE_WHITENED
 from sms_online.stream import Array
 from sms_online.tables import Tabled
 from sms_online.torque_prediction import TorqueCourse, TorquePrediction
@@ -40,90 +39,11 @@ from sms_online.verdict.reasons import (
 )
 
 SCHEMA = "sms-online/validation/1"
-# Parameters that predict another run within this multiple of what any parameters leave there hold for both.
-HOLDS = 1.15
-# And less than this share of a torque is none.
-NEGLIGIBLE = 0.01
 AS_WELL = "The parameters predict this run as well as those fitted to it"
 # What validation says of parameters: they hold; a torque is mostly noise, and contradicts nothing; they do as well as a
 # fit to the run, which leaves a large share of a torque unexplained; they hold but for the zero of a torque; they
 # differ from those of the run; nothing has them.
 Verdict = Literal["hold", "weak", "unexplained", "shifted", "differ", "impossible"]
-
-
-@dataclass(frozen=True)
-class Predicted:
-    """What fixed parameters leave of a force, as a share: rms over rms.
-
-    left: with everything fixed. least: fitted to this run, what the description itself lacks and noise, of which a fit
-    takes some for motion. rows: what is left of the momentum rows over the sensors' noise in them, None where that is
-    not known.
-    """
-
-    left: float
-    least: float
-    rows: RowResidual | None = None
-
-    @property
-    def ratio(self) -> float:
-        """The share that is left over the least possible one."""
-        return self.left / self.least if self.least > 0.0 else np.inf
-
-    @property
-    def holds(self) -> bool:
-        """Whether the parameters hold here: fitting them to this run would gain little, or noise alone."""
-        return self._as_fitted(self.left) or (self.rows is not None and not self.rows.beyond)
-
-    @property
-    def unexplained(self) -> bool:
-        """Whether a large share is left that is not noise."""
-        return self.left > NOISE_RESIDUAL and (self.rows is None or self.rows.whitened > NOISE_WHITENED)
-
-    def document(self) -> dict[str, float | str | None]:
-        """The entry of validation.json."""
-        noise = (None, None) if self.rows is None else (self.rows.whitened, self.rows.limit)
-        return {"left": self.left, "least": self.least, "whitened": noise[0], "limit": noise[1]}
-
-    def _as_fitted(self, left: float) -> bool:
-        return left <= max(NEGLIGIBLE, HOLDS * self.least)
-
-
-@dataclass(frozen=True)
-class PredictedTorque(Predicted):
-    """Of a joint's torque or force; a fit to this run is one of parameters and of a zero of each torque.
-
-    zero: what its channel reads too much throughout if the prediction is right, in `unit`; zero_share: its size over
-    rms of the torque.
-    """
-
-    channel: str = ""
-    unit: str = "N m"
-    zero: float = 0.0
-    zero_share: float = 0.0
-
-    @property
-    def beside_zero(self) -> float:
-        """The share that is left beside a zero of the torque, which each run has its own of."""
-        return float(np.sqrt(max(0.0, self.left**2 - self.zero_share**2)))
-
-    @property
-    def shifted(self) -> bool:
-        """Whether the parameters hold but for a zero of the torque."""
-        return not self.holds and self._as_fitted(self.beside_zero)
-
-    @property
-    def weak(self) -> bool:
-        """Whether most of the torque is left, and is noise: other parameters would do as well."""
-        return self.left > LARGEST_RESIDUAL and not self.unexplained
-
-    def document(self) -> dict[str, float | str | None]:
-        """See `Predicted`."""
-        return super().document() | {
-            "channel": self.channel,
-            "unit": self.unit,
-            "zero": self.zero,
-            "beside_zero": self.beside_zero,
-        }
 
 
 @dataclass(frozen=True, repr=False)
@@ -153,14 +73,14 @@ class Validation(Tabled):
     @property
     def verdict(self) -> Verdict:
         """What is said of the parameters; the first that applies, from the worst on."""
-        every, shifted = self._every(), [each for each in self.joints.values() if each.shifted]
+        every = self._every().values()
         if self.impossible:
             return "impossible"
-        if any(not each.holds and each not in shifted for each in every.values()):
+        if any(not (each.holds or each.shifted) for each in every):
             return "differ"
-        if shifted:
+        if any(each.shifted for each in every):
             return "shifted"
-        if any(each.unexplained for each in every.values()):
+        if any(each.unexplained for each in every):
             return "unexplained"
         return "weak" if any(each.weak for each in self.joints.values()) else "hold"
 
@@ -287,17 +207,17 @@ def validate(
         if residual is not None:
             residual.push(block)
     session.finish()
-    courses, least = prediction.courses, prediction.least()
+    courses = prediction.courses
     if not courses:
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
-    by_type, elastic = ({}, {}) if residual is None else residual.of(beta, gains)
+    least = prediction.least(courses)
+    by_type, deflections = ({}, {}) if residual is None else residual.of(beta, gains)
     joints = {
         name: PredictedTorque(
             each.left, least[name], by_type.get(name), each.channel, each.unit, each.zero, each.zero_share
         )
         for name, each in courses.items()
     }
-    deflections = {name: Predicted(each.left, each.least, each.rows) for name, each in elastic.items()}
     warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
     cannot = _impossible(session.model, session.base, beta, parameters)
     return Validation(

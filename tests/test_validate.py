@@ -12,7 +12,8 @@ import pytest
 import sms_online as sms
 from sms_online.description.parse import parse_system
 from sms_online.diagnosis.residuals import RowResidual
-from sms_online.validation import Predicted, PredictedTorque, Validation
+from sms_online.predicted import Predicted, PredictedTorque
+from sms_online.validation import Validation
 from sms_online.verdict.reasons import NOISE_RESIDUAL
 from sms_tools.cli import main
 from tests.one_link import one_link

@@ -24,7 +24,7 @@ from sms_online.diagnosis.improvement import (
 )
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
 from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
-from sms_online.diagnosis.record import SampleRecord
+from sms_online.diagnosis.record import SampleRecord, Segment
 from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.torque_zeros import HELD_OUT, TorqueZero, torque_zeros, without_zeros
 from sms_online.diagnosis.unexplained import describe_residual
@@ -78,7 +78,7 @@ def diagnose(
         runs, holdout = [undone(run, corrected) for run in runs], undone(holdout, corrected)
         before, record = _session(system, runs, source, prior)
         _noise(before, source)
-    held = _session(system, [holdout], source, prior)[1].segments() if holdout else []
+    held = _held(system, holdout, source, prior)
     case = Case(
         source, before, _noise(before, source), record.segments(), held, prior, progress, stop, learned,
         begins(runs),
@@ -90,8 +90,7 @@ def diagnose(
         progress("; ".join(zero.sentence for zero in zeros), FITTED_ONCE)
         runs = [without_zeros(run, zeros, number) for number, run in enumerate(runs)]
         before, record = _session(system, runs, source, prior)
-        if holdout:
-            held = _session(system, [without_zeros(holdout, zeros, HELD_OUT)], source, prior)[1].segments()
+        held = _held(system, without_zeros(holdout, zeros, HELD_OUT), source, prior)
         noise = _noise(before, source)
         case = replace(case, session=before, noise=noise, segments=record.segments(), held=held)
         case, attempt = _first(case, system)
@@ -279,6 +278,11 @@ def _check_balanced(session: Estimator, source: str) -> None:
         raise InputError(
             source, "", f"{lacking}, so no momentum balance", "a system whose coordinates are all measured"
         )
+
+
+def _held(system: System, holdout: Sequence[Block], source: str, prior: PriorOf) -> list[Segment]:
+    """Samples of the capture that is held out, as a session of its own has them; none without one."""
+    return _session(system, [holdout], source, prior)[1].segments() if holdout else []
 
 
 def _noise(session: Estimator, source: str) -> SensorNoise:

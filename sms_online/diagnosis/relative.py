@@ -21,7 +21,7 @@ class RelativeResiduals:
     """Rows of the joints over the session, of a model and of effects beside it.
 
     times (W,): the windows' middles, s since grid index 0. segment (W,): numbers of the segments that hold them.
-    measured (W, joints): torques or forces. weight: ∫ φ dt of a window, s.
+    measured (W, joints): torques or forces. columns (W, joints, n + c): of the parameters and the effects declared.
     """
 
     def __init__(self, rows: SessionRows, make: CandidateColumns, gapless: bool = False) -> None:
@@ -47,11 +47,9 @@ class RelativeResiduals:
         self._Y = rows.base.columns(physical)
         joints = len(layout.q)
         torque = -weak.columns(lambda motion: (None, motion.torque[:, :joints, None]))[..., 0]
-        one = -weak.columns(lambda motion: (None, np.ones((len(motion.x), joints, 1))))[..., 0]
-        self.weight = float(one.mean())
         self.measured = torque
         self._b = torque - rows.base.known_part(physical)
-        self._effects: list[Array] = []
+        self.columns = self._Y
         names = [p.name for p in rows.base.parameters]
         springs = [f"joint_{i}.stiffness" for i in range(1, len(self._joints) + 1)]
         self._springs = [names.index(spring) if spring in names else None for spring in springs]
@@ -83,7 +81,8 @@ class RelativeResiduals:
 
     def declare(self, effects: Sequence[Effect]) -> None:
         """Effects whose coefficients a solution holds after the model's parameters, in this order."""
-        self._effects = [self._make.of(effect).columns[:, self._joints] for effect in effects]
+        added = [self._make.of(effect).columns[:, self._joints] for effect in effects]
+        self.columns = np.concatenate([self._Y, *added], axis=2)
 
     def of(self, solution: Array, held: Iterable[tuple[Mask, Array]] = ()) -> dict[str, float]:
         """By joint, for a solution (n + c + m,); held: windows (W,) that another solution predicts.
@@ -97,15 +96,9 @@ class RelativeResiduals:
         ratio = np.divide(np.linalg.norm(rest, axis=0), size, out=np.zeros_like(size), where=size > 0.0)
         return {joint_rows(i): float(r) for i, r in enumerate(ratio)}
 
-    @property
-    def columns(self) -> Array:
-        """Of the parameters and the effects declared, (W, joints, n + c)."""
-        return np.concatenate([self._Y, *self._effects], axis=2)
-
     def left(self, solution: Array) -> Array:
         """What a solution (n + c + m,) leaves of the torques in the rows, (W, joints)."""
-        columns = self.columns
-        c = columns.shape[2]
+        c = self.columns.shape[2]
         stiffness = [0.0 if k is None else solution[k] for k in self._springs]
         calibrated = stiffness * (self._deflections @ solution[c:]) - self._torques @ solution[c:]
-        return np.asarray(self._b - columns @ solution[:c] + calibrated)
+        return np.asarray(self._b - self.columns @ solution[:c] + calibrated)

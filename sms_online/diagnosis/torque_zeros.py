@@ -18,6 +18,7 @@ from sms_online.diagnosis.attempt import Attempt
 from sms_online.diagnosis.constants import is_constant
 from sms_online.diagnosis.evidence import solution_of
 from sms_online.diagnosis.relative import RelativeResiduals
+from sms_online.pipeline.joint_balance import JointBalance
 from sms_online.stream import Array, Block, Indices
 
 # A zero is taken off where it is this share of the rms of its torque, and no chance but with this probability.
@@ -76,13 +77,14 @@ def torque_zeros(attempt: Attempt) -> list[TorqueZero]:
     described = np.concatenate((described[:n], np.zeros(joints.columns.shape[2] - n), described[n:]))
     offsets = _Offsets(joints, elsewhere, described, np.searchsorted(attempt.case.begins, joints.times))
     sensing, system, out = attempt.rows.sensing, attempt.system, []
+    weight = JointBalance(attempt.rows.model, attempt.rows.base, system.sample_rate).weight
     for capture in offsets.comparable:
         offset, std, size = offsets.against_first(capture)
         # Few stretches give a deviation that is uncertain itself.
         most = float(student_t.isf(0.5 * FALSE_ALARM, offsets.freedom(capture)))
         for i, (channel, ratio) in sensing.drives.items():
             if abs(offset[i]) > max(LEAST_SHARE * size[i], most * std[i]) and size[i] > 0.0:
-                value, deviation = (float(each[i]) / (joints.weight * ratio) for each in (offset, std))
+                value, deviation = (float(each[i]) / (weight * ratio) for each in (offset, std))
                 unit = channel_unit(system, channel)
                 out.append(TorqueZero(channel, capture, value, deviation, unit, any(system.gravity)))
     return out
@@ -109,11 +111,10 @@ class _Offsets:
         size = np.linalg.norm(joints.measured, axis=0)
         weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
         columns, left = joints.columns, joints.left(described)
-        self._parts = {
-            k: _Part(columns[own], left[own], joints.measured[own], weight)
-            for k in np.unique(capture).tolist()
-            if np.any(own := capture == k)
-        }
+        self._parts = {}
+        for k in np.unique(capture).tolist():
+            own = capture == k
+            self._parts[k] = _Part(columns[own], left[own], joints.measured[own], weight)
         self._fitted = list(self._parts)
         if elsewhere is not None:
             self._parts[HELD_OUT] = _Part(elsewhere.columns, elsewhere.left(described), elsewhere.measured, weight)

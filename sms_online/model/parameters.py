@@ -135,6 +135,8 @@ def _with_motor_rate(E: Array) -> Array:
     return padded
 
 
+# Ends of the names of parameters whose forces grow with a deflection.
+ELASTIC = ("stiffness", "rigidity", "rigidity_y", "rigidity_z")
 RIGIDITIES = {
     "flexural_rigidity_z": "EI",
     "flexural_rigidity_y": "EI_y",

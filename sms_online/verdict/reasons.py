@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
+from sms_online.model.parameters import ELASTIC
 from sms_online.nominal import NominalComparison
 from sms_online.pipeline.tracker_bank import Suspected
 from sms_online.row_types import LARGEST_RESIDUAL, NOISE_WHITENED, Residuals
@@ -25,7 +26,7 @@ LONGEST_UNWATCHED = 60.0
 # Names in a sentence; the others are counted.
 NAMED = 2
 # Without a spring, a mass or a rigidity nobody simulates the arm: green needs them, by the ends of their names.
-VITAL = ("mass", "mass_per_length", "stiffness", "rigidity", "rigidity_y", "rigidity_z")
+VITAL = ("mass", "mass_per_length", *ELASTIC)
 # Word for what may be at either of two places.
 UNDECIDED = "ambiguous place"
 # What to do next.
