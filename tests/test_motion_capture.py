@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from sms_adapters.motion_capture import import_points
+from sms_adapters.camera_capture import import_points
 from sms_adapters.sources import open_source
 from sms_online.description.bodies import Marker
 from sms_online.description.schema import System
@@ -55,7 +55,7 @@ def system() -> System:
 
 def imported(source: Path, system: System) -> Array:
     capture = source.with_name("points.csv")
-    samples, warnings = import_points(source, system, capture)
+    samples, warnings, _ = import_points(source, system, capture)
     assert samples == 3
     assert warnings == []
     (block,) = open_source(capture, system)

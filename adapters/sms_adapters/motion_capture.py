@@ -1,4 +1,4 @@
-"""Files of motion captures, C3D and the CSV exports of Motive and Nexus, as a capture of a system's points.
+"""Files of motion captures, C3D and the CSV exports of Motive and Nexus, as markers and rigid bodies by their names.
 
 Source: The C3D File Format, c3d.org (by ezc3d); OptiTrack, Motive: data export, CSV; Vicon Nexus: ASCII export.
 """
@@ -6,66 +6,39 @@ Source: The C3D File Format, c3d.org (by ezc3d); OptiTrack, Motive: data export,
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from sms_adapters.extras import installed
-from sms_adapters.mcap_capture import capture_writer
-from sms_online.description.channels import point_channels
-from sms_online.description.explain import hint, nearest
-from sms_online.description.schema import System
 from sms_online.errors import InputError
-from sms_online.stream import Array, Block
+from sms_online.stream import Array
 
 METRES = {"m": 1.0, "meters": 1.0, "cm": 0.01, "centimeters": 0.01, "mm": 1e-3, "millimeters": 1e-3}
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Markers by their names: t (B,), s, and positions (B, M, 3), m, in the file's axes, NaN where one is not seen."""
+    """Markers and rigid bodies by their names, in the file's axes, NaN where one is not seen.
+
+    t (B,): s. positions (B, M, 3): of the markers, m. bodies: names of the rigid bodies, to the positions (B, 3) of
+    their origins, m, and their Euler parameters (B, 4), the scalar last, body to file.
+    """
 
     t: Array
     names: tuple[str, ...]
     positions: Array
+    bodies: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
 
 
-def import_points(source: Path, system: System, capture: Path) -> tuple[int, list[str]]:
-    """Write the capture of the points of a system's markers; number of samples, and what was left out.
-
-    A marker of the file is that of the system with the same `name`; the part before its last colon, the subject, may
-    be left out. Raises InputError where the file is none of a motion capture or holds none of the system's markers.
-    """
+def read_tracks(source: Path) -> Tracks:
+    """What a file of a motion capture holds; InputError where it is none."""
     suffix = source.suffix.lower()
     if suffix not in READERS:
         raise InputError(str(source), "", f"a file {suffix!r}", f"a motion capture: {', '.join(READERS)}")
-    tracks = READERS[suffix](source)
-    short = [name.rpartition(":")[2] for name in tracks.names]
-    channels: list[str] = []
-    columns: list[Array] = []
-    used: set[int] = set()
-    named = []
-    for i, link in enumerate(system.links, start=1):
-        axes = len(point_channels(system, i)) // max(1, len(link.points))
-        for j, marker in enumerate(link.markers, start=1):
-            named.append(marker.name)
-            names = list(tracks.names) if marker.name in tracks.names else short
-            if not marker.name or marker.name not in names:
-                continue
-            used.add(names.index(marker.name))
-            channels += point_channels(system, i)[axes * (j - 1) : axes * j]
-            columns.append(tracks.positions[:, names.index(marker.name), :axes])
-    if not channels:
-        found = f"markers {', '.join(tracks.names) or 'without names'}"
-        wanted = ", ".join(filter(None, named)) or "none has a name"
-        near = nearest(short[0], named) if short else None
-        raise InputError(str(source), "", found, f"those of {system.name}: {wanted}{hint(near)}")
-    with capture_writer(capture, tuple(channels)) as writer:
-        writer.write(Block(tracks.t, tuple(channels), np.concatenate(columns, axis=1)))
-    left = [name for k, name in enumerate(tracks.names) if k not in used]
-    return tracks.t.size, [f"markers left out: {', '.join(left)}"] if left else []
+    return READERS[suffix](source)
 
 
 def read_c3d(source: Path) -> Tracks:
@@ -108,12 +81,23 @@ def _motive(source: Path, rows: list[list[str]]) -> Tracks:
     begin = rows[0].index("Length Units") + 1 if "Length Units" in rows[0] else 0
     scale = _scale(source, rows[0][begin] if begin else "Meters")
     columns: dict[str, list[int]] = {}
-    for k, (kind, name, axis) in enumerate(zip(heads["Type"], heads["Name"], rows[top], strict=False)):
+    bodies: dict[str, dict[tuple[str, str], int]] = {}
+    heading = zip(heads["Type"], heads["Name"], rows[top - 1], rows[top], strict=False)
+    for k, (kind, name, quantity, axis) in enumerate(heading):
         # Rigid bodies repeat their markers as the solver places them; measured ones are of type Marker.
         if kind == "Marker" and axis in ("X", "Y", "Z"):
             columns.setdefault(name, []).append(k)
+        elif kind == "Rigid Body":
+            bodies.setdefault(name, {})[quantity, axis] = k
     numbers = _numbers(source, rows, top + 1)
-    return _tracks(source, numbers[:, 1], columns, numbers * scale)
+    poses = {}
+    for name, own in bodies.items():
+        places = [own["Position", axis] for axis in "XYZ" if ("Position", axis) in own]
+        turns = [own["Rotation", axis] for axis in "XYZW" if ("Rotation", axis) in own]
+        # Rotations exported as Euler angles have no W.
+        if (len(places), len(turns)) == (3, 4):
+            poses[name] = numbers[:, places] * scale, numbers[:, turns]
+    return replace(_tracks(source, numbers[:, 1], columns, numbers * scale), bodies=poses)
 
 
 def _vicon(source: Path, rows: list[list[str]]) -> Tracks:

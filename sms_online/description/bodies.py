@@ -56,9 +56,11 @@ class Spacecraft(RigidBody):
     """The free-floating base. Frame {0} has its origin in joint 1, so center_of_mass is -r_0 of (10).
 
     tracked_point: position of S from joint 1, ⁰r_Sj1 of (16), m.
+    name: of its rigid body in a file of a motion capture, with S as its origin and the axes of {0}.
     """
 
     tracked_point: Vector3 = (0.0, 0.0, 0.0)
+    name: str = ""
 
 
 class Motor(Record):

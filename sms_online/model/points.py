@@ -89,3 +89,16 @@ class Points:
         configuration, n_v = self._chain.configure(x), self._chain.layout.n_v
         parts = [link.by_displacement(configuration)[:, :, self._axes].reshape(len(x), -1, n_v) for link in self.links]
         return np.concatenate(parts, axis=1)
+
+    def by_place(self, x: Array) -> Array:
+        """Their derivatives by the places of the markers, in the axes of their links, (B, channels, markers · axes)."""
+        configuration, axes = self._chain.configure(x), self._axes
+        out = np.zeros((len(x), len(self.names), len(self.names)))
+        at = 0
+        for link in self.links:
+            turned = configuration.frames[2 * link.link + 2].rotation[:, axes][:, :, axes]
+            for _ in range(len(link.names) // len(axes)):
+                own = slice(at, at + len(axes))
+                out[:, own, own] = turned
+                at += len(axes)
+        return out

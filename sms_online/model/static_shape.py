@@ -75,6 +75,11 @@ class PointedShape:
         self._precision = np.diag(np.concatenate((np.zeros(kinematics.n_f), 1.0 / frame**2)))
         self._precision[: kinematics.n_f, : kinematics.n_f] = stiffness * soft / (USUAL_DEFLECTION * length) ** 2
 
+    @property
+    def usual(self) -> Array:
+        """Covariance (n_f, n_f) of the elastic coordinates of the shapes that the link usually takes."""
+        return np.asarray(np.linalg.inv(self._precision[: self._n_f, : self._n_f]))
+
     def coordinates(self, readings: Array, origin: Array, rotation: Array) -> Array:
         """q_f (B, n_f) for positions (B, n · axes), m, NaN where a marker is not seen.
 

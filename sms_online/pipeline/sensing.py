@@ -182,6 +182,11 @@ class Sensing:
         axes = [0, 1] if model.layout.planar else [0, 1, 2]
         return PointedShape(link.length, kinematics, points, axes, sigma if sigma > 0.0 else USUAL_NOISE)
 
+    @property
+    def usual_shapes(self) -> dict[int, Array]:
+        """Covariance (n_f, n_f) of the shapes that each link (from 0) usually takes which cameras see as points."""
+        return {i: shape.usual for i, (shape, _) in self._pointed.items()}
+
     def readings(self, x: Array) -> Array:
         """Readings (K, n_x) of the position sensors at coordinates x (K, n_x): where no marker is missing."""
         out = x.copy()

@@ -311,6 +311,8 @@ def _add_import(verbs: Verbs) -> None:
     text = "for log and points: the system file, whose [[source]] tables or marker names describe the contents"
     parser.add_argument("--system", metavar="FILE|NAME", help=text)
     _add_capture(parser, required=False)
+    text = "for points: what drives and encoders recorded meanwhile; the capture then holds both, on this one's clock"
+    parser.add_argument("--beside", metavar="RECORDED", type=Path, help=text)
     text = "for urdf: the system file to write; SOURCE with the ending .toml by default"
     parser.add_argument("--out", metavar="FILE.toml", type=Path, help=text)
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from sms_adapters.camera_capture import import_points
 from sms_adapters.files import write_text
 from sms_adapters.importers import import_emps, import_quanser
 from sms_adapters.mcap_capture import capture_writer
-from sms_adapters.motion_capture import import_points
+from sms_adapters.sources import open_source
 from sms_adapters.truth import truth_path
 from sms_adapters.urdf import import_urdf
 from sms_online.errors import InputError
@@ -19,8 +20,8 @@ from sms_tools.report import say
 from sms_tools.session import described_system
 from sms_tools.waiting import watched
 
-# Writes the capture of a source; number of its samples, and what was skipped.
-Importer = Callable[[argparse.Namespace], tuple[int, list[str]]]
+# Writes the capture of a source; number of its samples, what was skipped, and what was found.
+Importer = Callable[[argparse.Namespace], tuple[int, list[str], list[str]]]
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,12 +32,15 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"import {args.kind}", "", "no --capture", "--capture FILE, the capture to write")
     if args.capture.resolve() == args.source.resolve():
         raise InputError(f"import {args.kind}", "--capture", f"{args.capture}, the source itself", "another file")
-    samples, warnings = KINDS[args.kind](args)
+    samples, warnings, found = KINDS[args.kind](args)
     # What a simulation of the same name left would pass for the truth of a measurement.
     truth_path(args.capture).unlink(missing_ok=True)
     lines = [f"warning: {warning}" for warning in warnings]
-    document = {"schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples, "warnings": warnings}
-    say(args, f"capture: {args.capture}, {samples} samples", *lines, document=document)
+    document = {
+        "schema": "sms-online/import/1", "capture": str(args.capture), "samples": samples, "warnings": warnings,
+        "found": found,
+    }  # fmt: skip
+    say(args, f"capture: {args.capture}, {samples} samples", *found, *lines, document=document)
     return OK
 
 
@@ -51,11 +55,11 @@ def _urdf(args: argparse.Namespace) -> int:
     return OK
 
 
-def _published(convert: Callable[[Path, Path], int], args: argparse.Namespace) -> tuple[int, list[str]]:
-    return convert(args.source, args.capture), []
+def _published(convert: Callable[[Path, Path], int], args: argparse.Namespace) -> tuple[int, list[str], list[str]]:
+    return convert(args.source, args.capture), [], []
 
 
-def _log(args: argparse.Namespace) -> tuple[int, list[str]]:
+def _log(args: argparse.Namespace) -> tuple[int, list[str], list[str]]:
     """Any log that `replay` reads."""
     if args.system is None:
         raise InputError("import log", "", "no --system", "the system file, which says what the log's numbers are")
@@ -68,15 +72,18 @@ def _log(args: argparse.Namespace) -> tuple[int, list[str]]:
         for block in reading:
             writer.write(block)
             samples += block.t.size
-    return samples, list(reading.warnings)
+    return samples, list(reading.warnings), []
 
 
-def _points(args: argparse.Namespace) -> tuple[int, list[str]]:
-    """Points of a motion capture's file."""
+def _points(args: argparse.Namespace) -> tuple[int, list[str], list[str]]:
+    """Points of a motion capture's file, alone or with what drives recorded meanwhile."""
     if args.system is None:
         raise InputError("import points", "", "no --system", "the system file, whose markers have names")
-    system, _ = described_system(args)
-    return import_points(args.source, system, args.capture)
+    system, folder = described_system(args)
+    if args.beside is None:
+        return import_points(args.source, system, args.capture)
+    drives = open_source(args.beside, system, directory=folder)
+    return import_points(args.source, system, args.capture, drives)
 
 
 KINDS: dict[str, Importer] = {
