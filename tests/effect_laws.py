@@ -14,7 +14,7 @@ from sms_online.model.model import Model
 from sms_online.stream import Array
 from tests.model_systems import paper, random_states
 
-GEAR, K = 50.0, 1000.0  # of both joints of the planar example
+GEAR, K, B = 50.0, 1000.0, 75.85  # of both joints of the planar example
 STATES = 12
 # Speeds of the planar example: x, y, θ_0, q_1, q_2, θ_m1, θ_m2, then four a link.
 Q_1, M_1, M_2, LINK_2 = 3, 5, 6, slice(11, 15)
@@ -47,6 +47,15 @@ def spring(force: Array) -> dict[int, Array]:
     return {M_1: force, Q_1: -force}
 
 
+def _kinematic_error(s: Motion, amplitude: float, phase: float) -> dict[int, Array]:
+    """Of a spring and a damper on δ + e, whose torque works at both sides, what they do beyond e = 0 to first order."""
+    psi, turns = 2 * GEAR * s.theta_m - phase, 2 * GEAR
+    e, slope = amplitude * np.cos(psi), -amplitude * turns * np.sin(psi)
+    plain = K * s.delta + B * (s.rate - s.link_rate)
+    torque = K * e + B * slope * s.rate
+    return {M_1: -torque - slope * plain, Q_1: torque}
+
+
 # Effect as declared to its generalized force, speed by speed.
 LAWS: dict[str, Law] = {
     "viscous_friction@joint_1:damping=0.4": lambda s: {M_1: -0.4 * s.rate},
@@ -65,9 +74,7 @@ LAWS: dict[str, Law] = {
     "backlash@joint_1:gap=0.6": lambda s: spring(
         K * s.delta - K * np.sign(s.delta) * np.maximum(np.abs(s.delta) - 0.6, 0.0)
     ),
-    "kinematic_error@joint_1:amplitude=0.01,phase=0.3": lambda s: spring(
-        -K * 0.01 * np.cos(2 * GEAR * s.theta_m - 0.3)
-    ),
+    "kinematic_error@joint_1:amplitude=0.01,phase=0.3": lambda s: _kinematic_error(s, 0.01, 0.3),
     "cogging@joint_1:amplitude=0.4,phase=-2,order=3": lambda s: {M_1: 0.4 * np.cos(3 * GEAR * s.theta_m + 2)},
     "torque_ripple@joint_1:amplitude=0.04,phase=1,order=4": lambda s: {
         M_1: s.tau[:, 0] * 0.04 * np.cos(4 * GEAR * s.theta_m - 1)

@@ -53,3 +53,16 @@ def test_encoders_on_either_side_of_a_soft_spring_are_alike(capture: sms.Capture
     found = sms.check(SYSTEM, capture)
     assert found.passed
     assert not [remark for remark in found.remarks if "turns" in remark.text]
+
+
+def test_a_gear_ratio_that_no_spring_explains_is_named(capture: sms.Capture) -> None:
+    stiff = sms.load_system(SYSTEM)
+    joints = (stiff.joints[0].model_copy(update={"stiffness": 1e6}), *stiff.joints[1:])
+    q = capture.values[:, capture.channels.index("q_1")]
+    values = capture.values.copy()
+    values[:, capture.channels.index("theta_m_1")] = 1.25 * q
+    found = sms.check(stiff.model_copy(update={"joints": joints}), replace(capture, values=values))
+    assert not found.passed
+    (remark,) = (remark for remark in found.remarks if "turns" in remark.text)
+    assert remark.channel == "theta_m_1"
+    assert "a gear ratio of 62.5 in place of 50, or a far softer spring" in remark.text

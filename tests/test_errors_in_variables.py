@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.stream import Array
@@ -161,3 +162,27 @@ def test_few_parameters_more_leave_the_shift_of_the_others() -> None:
     bias.widen(2)
     after = bias.correction(np.array([True, False, False]))[0]
     assert after.tolist() == [before, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_parameters_that_rows_know_together_are_shifted_together(seed: int) -> None:
+    """Attenuation of the first of [2 1/2 1/2] bends the sum of the others, which each alone are hardly known."""
+    rng = np.random.default_rng(seed)
+    x, apart, tiny = rng.standard_normal((3, 5000))
+    exact = np.stack((x, x + 0.3 * apart, x + 0.3 * apart + 0.003 * tiny), axis=1)
+    b = exact @ [2.0, 0.5, 0.5] + RESIDUAL * rng.standard_normal(5000)
+
+    def measured(noise: Array) -> Array:
+        return np.column_stack((exact + noise.T * [0.1, 0.0, 0.001], b))
+
+    own, added = rng.standard_normal((2, 3, 5000))
+    rows = measured(own)
+    found = least_squares(rows)
+    freed = (
+        found
+        + gathered(rows, np.stack([measured(own + added), measured(own - added)])).correction(np.ones(3, dtype=bool))[0]
+    )
+    assert_allclose(freed[0], 2.0, atol=0.03)
+    assert_allclose(freed[1:].sum(), 1.0, atol=0.03)
+    left = [float(np.sum((b - rows[:, :-1] @ each) ** 2)) for each in (freed, found)]
+    assert left[0] < 1.15 * left[1]

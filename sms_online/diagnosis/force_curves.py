@@ -177,7 +177,7 @@ def _coefficients(diagnosis: Search, k: int) -> Array:
 
 
 def added_variables(diagnosis: Search) -> list[AddedVariable]:
-    """Rows of the effects found that have no curve."""
+    """Rows of the effects found that have no curve, where they are more than a combination of the model's own."""
     attempt, described = diagnosis.attempt, diagnosis.described
     chosen = [attempt.tracing.candidates[k] for k in diagnosis.chosen]
     out = []
@@ -190,7 +190,7 @@ def added_variables(diagnosis: Search) -> list[AddedVariable]:
         elif candidate.traits.curve is None:
             others = [*attempt.fixed, *(other for other in chosen if other is not candidate)]
             out.append(_added_variable(attempt, others, candidate))
-    return out
+    return [added for added in out if added.expected.size]
 
 
 def _added_variable(attempt: Attempt, others: list[Candidate], own: Candidate) -> AddedVariable:

@@ -106,10 +106,12 @@ class Backlash(Transmission):
 
 
 class KinematicError(Transmission):
-    """f = -k e along δ, e = a cos(p n θ_m - φ) rad: the gear's output is off by e, `order` p = 2 times a motor turn.
+    """The gear's output is off by e = a cos(p n θ_m - φ) rad, `order` p = 2 times a turn of the motor.
 
-    a: `amplitude`, rad; φ: `phase`, rad; linear in π are k a cos φ and k a sin φ, N m.
-    Limitations: the torque e' k e by which the error also drives the motor, e' = de/dθ_m, is left out.
+    Its spring and damper feel δ + e: f = -k e - b ė along δ. The work of their torque turns the motor back by
+    -e' (k δ + b δ̇), e' = de/dθ_m. a: `amplitude`, rad; φ: `phase`, rad; linear in π are k a cos φ and k a sin φ, N m.
+    Limitations: b / k is that of the description; the torque -e' (k e + b ė) of second order is left out.
+    Source: Ghorbel, Gandhi, Alpeter, J. Mechanical Design 123 (2001) 90.
     """
 
     entry = Entry(
@@ -126,14 +128,32 @@ class KinematicError(Transmission):
     def __init__(self, site: Site, given: Mapping[str, float]) -> None:
         linear = nominal_parts("e", site.index, "N m", given, site.system.joints[site.index - 1].stiffness)
         super().__init__(site, given, linear)
-        self.gear_ratio = site.gear_ratio
+        joint = site.system.joints[site.index - 1]
+        self._turns = site.gear_ratio
+        self._damping = joint.damping / joint.stiffness if joint.stiffness else 0.0  # b / k, s
         self.relative_to = (f"joint_{site.index}.stiffness",)
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """-cos and -sin of p n θ_m."""
-        theta_m = position(layout, x, layout.theta_m[self.index - 1])
-        return -phase_columns(self.shapes["order"] * self.gear_ratio * theta_m)
+        """-(e + b/k ė) of unit amplitudes of cosine and sine."""
+        e, slope = self._error(layout, x)
+        rate = v[:, layout.theta_m[self.index - 1], None]
+        return -(e + self._damping * slope * rate)
+
+    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
+        """That along δ, and on the motor alone what the slope of the error makes of the spring's torque."""
+        f = super().force(layout, x, v, inputs)
+        _, slope = self._error(layout, x)
+        spring = deflection(layout, x, self.index - 1) + self._damping * self.rate(layout, v)
+        f[:, layout.theta_m[self.index - 1]] -= slope * spring[:, None]
+        return f
+
+    def _error(self, layout: Layout, x: Array) -> tuple[Array, Array]:
+        """e and de/dθ_m (B, 2) of unit amplitudes of cosine and sine."""
+        turns = self.shapes["order"] * self._turns
+        e = phase_columns(turns * position(layout, x, layout.theta_m[self.index - 1]))
+        return e, turns * np.stack((-e[:, 1], e[:, 0]), axis=1)
 
     def reported(self, values: Array) -> dict[str, float]:
         """a and φ, for the stiffness k of the estimate."""
-        return amplitude_and_phase(values[:2] / values[2]) | dict(self.shapes)
+        with np.errstate(divide="ignore", invalid="ignore"):  # where the estimate has no spring
+            return amplitude_and_phase(values[:2] / values[2]) | dict(self.shapes)

@@ -114,23 +114,24 @@ class NoiseBias(State):
         along = directions.T @ gram[:-1, -1]
         lost = share >= LARGEST_SHARE
         kept = directions[:, ~lost]
-        whole = kept @ ((kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost])
+        whole = (kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost]
         apart = np.abs(1.0 - share[lost])
         factor = np.clip(share[lost] / np.maximum(apart, 1.0 / LARGEST_FACTOR), 1.0, LARGEST_FACTOR)
         attenuated = along[lost] * (LARGEST_FACTOR if lost_unknown else factor)
         # Each cluster's part of it, to first order.
-        parts = kept @ (kept.T @ (clusters[:, :-1] @ np.append(directions @ along, -1.0)).T)
+        parts = kept.T @ (clusters[:, :-1] @ np.append(directions @ along, -1.0)).T
         count = parts.shape[1]
         if count > 1:
             parts = (parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(count / (count - 1.0))
+        # Direction by direction: parameters that rows know together are shifted together.
         doubt = stdtrit(max(1, count - 1), EVIDENCE) ** 2 * np.sum(parts**2, axis=1)
         certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
         unit = size[-1] / size[:-1]
-        shift[known] = certain * whole * unit
+        shift[known] = kept @ (certain * whole) * unit
         left = np.diag((1.0 - certain) * whole)
-        parts = np.concatenate((parts, certain[:, None] * parts, left, directions[:, lost] * attenuated), axis=1)
-        parts *= unit[:, None]
-        covariance[np.ix_(known, known)] = parts @ parts.T
+        spread = kept @ np.concatenate((parts, certain[:, None] * parts, left), axis=1)
+        spread = np.concatenate((spread, directions[:, lost] * attenuated), axis=1) * unit[:, None]
+        covariance[np.ix_(known, known)] = spread @ spread.T
         return shift, covariance
 
     @property
