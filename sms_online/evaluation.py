@@ -187,7 +187,8 @@ class Evaluation:
             return momentum.reference
         # An attenuated estimate of what rows hardly determine would leave its signal in the residual.
         found, m = nearer(self.estimate, *described(self.model, self.base)), len(self.statistics.setup.nuisances)
-        return found if found.size == m + self.base.n else np.concatenate((np.zeros(m), found))
+        by_balance = self.statistics.method != "smoother" and found.size == m + self.base.n
+        return found if by_balance else np.concatenate((np.zeros(m), found[found.size - self.base.n :]))
 
     @cached_property
     @one_blas_thread()
@@ -237,7 +238,8 @@ class Evaluation:
     @cached_property
     def calibration(self) -> list[Calibration]:
         """The calibration constants that the session determines better than the description's tolerances."""
-        estimate, nuisances = self.estimate, self.statistics.setup.nuisances
+        estimate, setup = self.estimate, self.statistics.setup
+        nuisances = setup.smoothed if self.statistics.method == "smoother" else setup.nuisances
         if estimate.nuisances.size != len(nuisances) or estimate.dof <= 0.0:
             return []
         std = max(1.0, float(np.sqrt(estimate.rss / estimate.dof))) * estimate.nuisances_std

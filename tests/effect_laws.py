@@ -48,12 +48,9 @@ def spring(force: Array) -> dict[int, Array]:
 
 
 def _kinematic_error(s: Motion, amplitude: float, phase: float) -> dict[int, Array]:
-    """Of a spring and a damper on δ + e, whose torque works at both sides, what they do beyond e = 0 to first order."""
+    """Of a spring and a damper on δ + e."""
     psi, turns = 2 * GEAR * s.theta_m - phase, 2 * GEAR
-    e, slope = amplitude * np.cos(psi), -amplitude * turns * np.sin(psi)
-    plain = K * s.delta + B * (s.rate - s.link_rate)
-    torque = K * e + B * slope * s.rate
-    return {M_1: -torque - slope * plain, Q_1: torque}
+    return spring(-K * amplitude * np.cos(psi) + B * amplitude * turns * np.sin(psi) * s.rate)
 
 
 # Effect as declared to its generalized force, speed by speed.

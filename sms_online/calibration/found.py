@@ -85,7 +85,9 @@ class Calibration:
         value = abs(self.estimate) if positive != negative else self.estimate
         scales = SCALES.get(self.unit, ((self.unit, 1.0),))
         unit, factor = next((each for each in scales if max(abs(value), self.std) >= each[1]), scales[-1])
-        place = self.where if self.name in WORDS else f"{self.where}: {NAMES[self.name]}"
+        # A marker that is seen as a point may be off along each axis.
+        name = "place" if self.name == "marker_station" and self.part else NAMES.get(self.name, "")
+        place = self.where if self.name in WORDS else f"{self.where}: {name}"
         part = f" ({self.part})" if self.part else ""
         return f"{place}{part} {_rounded(value / factor, self.std / factor)} {unit} {words}"
 

@@ -106,12 +106,12 @@ class Backlash(Transmission):
 
 
 class KinematicError(Transmission):
-    """The gear's output is off by e = a cos(p n θ_m - φ) rad, `order` p = 2 times a turn of the motor.
+    """f = -k e - b ė along δ, e = a cos(p n θ_m - φ) rad: the gear's output is off by e, `order` p = 2 times a turn.
 
-    Its spring and damper feel δ + e: f = -k e - b ė along δ. The work of their torque turns the motor back by
-    -e' (k δ + b δ̇), e' = de/dθ_m. a: `amplitude`, rad; φ: `phase`, rad; linear in π are k a cos φ and k a sin φ, N m.
-    Limitations: b / k is that of the description; the torque -e' (k e + b ė) of second order is left out.
-    Source: Ghorbel, Gandhi, Alpeter, J. Mechanical Design 123 (2001) 90.
+    a: `amplitude`, rad; φ: `phase`, rad; linear in π are k a cos φ and k a sin φ, N m.
+    Limitations: b / k is that of the description. The torque -e' (k δ + b δ̇), e' = de/dθ_m, by which the spring drives
+    the motor back, is left out, for it holds the deflection, which late encoders falsify: it looks like a torque ripple
+    of the same order, of the amplitude a p n.
     """
 
     entry = Entry(
@@ -135,23 +135,10 @@ class KinematicError(Transmission):
 
     def along(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
         """-(e + b/k ė) of unit amplitudes of cosine and sine."""
-        e, slope = self._error(layout, x)
-        rate = v[:, layout.theta_m[self.index - 1], None]
-        return -(e + self._damping * slope * rate)
-
-    def force(self, layout: Layout, x: Array, v: Array, inputs: Inputs | None) -> Array:
-        """That along δ, and on the motor alone what the slope of the error makes of the spring's torque."""
-        f = super().force(layout, x, v, inputs)
-        _, slope = self._error(layout, x)
-        spring = deflection(layout, x, self.index - 1) + self._damping * self.rate(layout, v)
-        f[:, layout.theta_m[self.index - 1]] -= slope * spring[:, None]
-        return f
-
-    def _error(self, layout: Layout, x: Array) -> tuple[Array, Array]:
-        """e and de/dθ_m (B, 2) of unit amplitudes of cosine and sine."""
         turns = self.shapes["order"] * self._turns
         e = phase_columns(turns * position(layout, x, layout.theta_m[self.index - 1]))
-        return e, turns * np.stack((-e[:, 1], e[:, 0]), axis=1)
+        slope = turns * np.stack((-e[:, 1], e[:, 0]), axis=1)
+        return -(e + self._damping * slope * v[:, layout.theta_m[self.index - 1], None])
 
     def reported(self, values: Array) -> dict[str, float]:
         """a and φ, for the stiffness k of the estimate."""

@@ -14,6 +14,9 @@ from sms_online.model import so3
 from sms_online.model.chain import Chain, Configuration
 from sms_online.stream import Array
 
+# Step along a link by which places of markers are differentiated, m.
+STATION = 1e-4
+
 
 @dataclass(frozen=True)
 class Local:
@@ -37,6 +40,7 @@ class LinkPoints:
         if kinematics is not None:
             assert isinstance(link, FlexibleLink)
             self._sections = kinematics.sections(self._rest[:, 0])
+            self._before = kinematics.sections(self._rest[:, 0] - STATION)
             self._offset = self._rest * np.array([0.0, 1.0, 1.0])
 
     def whole(self, available: Sequence[str]) -> list[int]:
@@ -59,6 +63,16 @@ class LinkPoints:
         frame = configuration.frames[2 * self.link + 2]
         local = self.local(self._chain.elastic(configuration.x, self.link)).position
         return np.asarray(frame.origin[:, None] + local @ frame.rotation.swapaxes(1, 2))
+
+    def by_place(self, configuration: Configuration) -> Array:
+        """Their derivatives by station along the link and by offset along y and z, (B, n, 3, 3), the places last."""
+        rotation = configuration.frames[2 * self.link + 2].rotation[:, None]
+        if self._sections is None:
+            return np.broadcast_to(rotation, (len(rotation), len(self._rest), 3, 3))
+        q_f = self._chain.elastic(configuration.x, self.link)
+        here, before = self._sections(q_f), self._before(q_f)
+        moved = here.center - before.center + ((here.rotation - before.rotation) @ self._offset[..., None])[..., 0]
+        return np.asarray(rotation @ np.concatenate((moved[..., None] / STATION, here.rotation[..., 1:]), axis=3))
 
     def by_displacement(self, configuration: Configuration) -> Array:
         """Their derivatives by displacements in the order of the speeds, (B, n, 3, n_v)."""
@@ -91,14 +105,14 @@ class Points:
         return np.concatenate(parts, axis=1)
 
     def by_place(self, x: Array) -> Array:
-        """Their derivatives by the places of the markers, in the axes of their links, (B, channels, markers · axes)."""
+        """Their derivatives by the places of the markers, see `LinkPoints`, (B, channels, markers · axes)."""
         configuration, axes = self._chain.configure(x), self._axes
         out = np.zeros((len(x), len(self.names), len(self.names)))
         at = 0
         for link in self.links:
-            turned = configuration.frames[2 * link.link + 2].rotation[:, axes][:, :, axes]
-            for _ in range(len(link.names) // len(axes)):
+            by_place = link.by_place(configuration)[..., axes, :][..., axes]
+            for k in range(by_place.shape[1]):
                 own = slice(at, at + len(axes))
-                out[:, own, own] = turned
+                out[:, own, own] = by_place[:, k]
                 at += len(axes)
         return out

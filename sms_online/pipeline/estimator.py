@@ -242,7 +242,9 @@ class Estimator(Stage):
             current = None if self.momentum is None else self.momentum.current_prior
             now = self.model, self.base, self._base
             nuisances = () if self.momentum is None else self.momentum.nuisances
-            setup = Setup(self.system, *now, self.sensing, self.unused, self.prior, current, nuisances, self.trackers)
+            smoothed = () if self.smoother is None else self.smoother.nuisances
+            channels, priors = (self.sensing, self.unused), (self.prior, current)
+            setup = Setup(self.system, *now, *channels, *priors, nuisances, smoothed, self.trackers)
             self._setup = len(self.events), setup
         return self._setup[1]
 

@@ -46,8 +46,9 @@ class Setup:
 
     system: as described. model, base: with what events have added; described: base parameters of the system itself.
     unused: channels of the source that play no part. prior: on `described`; current_prior: on `base`, of which nothing
-    is known beforehand where something has changed. nuisances: what the description may be wrong in. trackers: of the
-    session, the judged one first. Pickled once, and one object wherever the same is read again.
+    is known beforehand where something has changed. nuisances: what the description may be wrong in; smoothed: what the
+    smoother's readings may. trackers: of the session, the judged one first. Pickled once, and one object wherever the
+    same is read again.
     """
 
     system: System
@@ -59,6 +60,7 @@ class Setup:
     prior: Prior | None
     current_prior: Prior | None
     nuisances: tuple[Nuisance, ...]
+    smoothed: tuple[Nuisance, ...]
     trackers: tuple[TrackerChoice, ...]
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -10,25 +10,22 @@ equations; Bell, SIAM J. Optimization 4 (1994) 626, for the iterated smoother as
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.linearised import Motion, linearise
-from sms_online.model.base_parameters import BaseParameters
-from sms_online.model.dynamics import Dynamics
-from sms_online.model.model import Model
-from sms_online.model.readings import Readings
-from sms_online.physical import PhysicalSet
 from sms_online.pipeline.description import described
-from sms_online.smoother.averaging import FEWEST_TARGETS, LONGEST_STEP, averaged
-from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
-from sms_online.smoother.filter import FixedIntervalSmoother
-from sms_online.smoother.span import Ending, Innovations, Span, interpolated
+from sms_online.smoother.search import (
+    LARGEST_MEAN_SQUARE,
+    NO_NUMBERS,
+    DivergedError,
+    Search,
+    SmoothedReadings,
+    SpanFit,
+)
+from sms_online.smoother.span import Ending, Span
 from sms_online.stream import Array
-from sms_online.trackers.factor import Solution, solve, triangular_factor
 
 # Levels of the white forces on the way, as shares of each coordinate's usual force. From one to the next the answer
 # moves by a fraction of what the first fit is off.
@@ -37,50 +34,8 @@ LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 LATER_LEVELS = (0.01, 0.001, 0.0)
 # And that of a span whose first state is known, too.
 NEXT_LEVELS = (0.0,)
-# Those that are allowed for where the samples refute exact equations; more than that is another system.
-ALLOWED = (0.001, 0.003, 0.01, 0.03)
-# A level is tried again while the innovations are larger than noise makes them, so often at most.
-MOST_TRIES = 3
-# Time within which forces of a level change, s: white forces of share r have the density (r F)² times this. None is to
-# change a speed within it by more than this multiple of r times the usual speed: light coordinates would run away.
-CORRELATION = 0.1
-MOST_SPEED = 3.0
-# No coordinate's usual force or speed is taken to be smaller than this share of the largest.
-LEAST_USUAL = 0.02
-# Free to move are positions of the first state by this, rad, m or 1/m, and its speeds by the usual ones. Not further:
-# stiff modes, which no sample sees, decay slowly in the collocation, and are not to ring.
-FREE_POSITION = 10.0
-# Steps of the collocation, s: on the way, and then ever finer until that changes no parameter by more than REFINED
-# standard deviations; the error of the last one is a sixteenth of that change, as its order is four.
-ROUGH_STEP = 0.01
+# Steps of the collocation, s, ever finer.
 STEPS = (0.005, 0.0025, 0.00125)
-REFINED = 1.0
-# A step of the search that moves no parameter by more standard deviations than this ends it: the next one would be
-# smaller by far, as the convergence is quadratic near the end.
-CONVERGED = 0.5
-MAX_STEPS = 16
-# Derivatives by displacements are computed that often and interpolated, s; they only steer the search.
-DERIVATIVES_INTERVAL = 0.04
-# Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
-# the noise behind it is estimated to a tenth.
-LARGEST_MEAN_SQUARE = 1.2
-# Directions of β with less information than this share of the best one's, in units of the columns' sizes, are left
-# as they are: derivatives are good to 1e-8.
-RANK_TOLERANCE = 1e-8
-# A step of the search is halved so often, where β is no mechanism's after it.
-MOST_HALVINGS = 6
-# Mass matrices are checked that often along the motion, s.
-MASS_INTERVAL = 0.1
-# Steps that swing about the answer are shortened to this share of their length at least.
-LEAST_RELAXATION = 0.125
-
-
-class DivergedError(ArithmeticError):
-    """The search found no parameters and states that agree with the samples."""
-
-
-# What a search that runs away ends in.
-NO_NUMBERS = (np.linalg.LinAlgError, ArithmeticError)
 
 
 @contextmanager
@@ -93,38 +48,8 @@ def _diverging() -> Iterator[None]:
         raise DivergedError(str(error)) from None
 
 
-@dataclass(frozen=True)
-class SpanFit:
-    """The information of a span at its end: a factor (n + 1, n + 1) of rows Y β = b with independent unit errors.
-
-    beta (n,): estimate from this span and what was known before it. rows: how many innovations. mean_square: of the
-    whitened innovations. level: of the white forces that are left, 0 where the equations hold. step: of the
-    collocation, s. ending: last state.
-    """
-
-    factor: Array
-    beta: Array
-    rows: int
-    mean_square: float
-    level: float
-    step: float
-    ending: Ending
-
-
-class SpanSmoother:
-    """Fits spans of one session.
-
-    readings: of the samples. sigma (C,): their noise, 1σ a sample. torque (joints,): σ² T_s of n τ, (N m)² s.
-    """
-
-    def __init__(self, model: Model, base: BaseParameters, readings: Readings, sigma: Array, torque: Array) -> None:
-        self._model = model
-        self._base = base
-        self._readings = readings
-        self._sigma = sigma
-        # Unit noise of each motor's mean torque to forces, (n_v, joints), N m √s.
-        self._motors = model.generalized_force(np.eye(torque.size)).T * np.sqrt(torque)
-        self._physical = PhysicalSet(model, base)
+class SpanSmoother(SmoothedReadings):
+    """Fits spans of one session."""
 
     def fit(
         self, span: Span, beta: Array, known: Array, last_step: float | None, before: Ending | None = None
@@ -139,12 +64,12 @@ class SpanSmoother:
                 return self._first(span, beta, known)
             if before is not None:
                 with suppress(*NO_NUMBERS):
-                    return _Search(self, span, beta, known, before=before).through(NEXT_LEVELS, (last_step,))
+                    return Search(self, span, beta, known, before=before).through(NEXT_LEVELS, (last_step,))
             try:
-                return _Search(self, span, beta, known).through(LATER_LEVELS, (last_step,))
+                return Search(self, span, beta, known).through(LATER_LEVELS, (last_step,))
             except NO_NUMBERS:
                 # Parameters are known, but not the motion, where cameras have not seen a link for a while.
-                return _Search(self, span, beta, known).through(LEVELS, (last_step,))
+                return Search(self, span, beta, known).through(LEVELS, (last_step,))
 
     def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
         search = self._begun(span, beta, known)
@@ -153,19 +78,21 @@ class SpanSmoother:
             # A start that is far off may end there too. From this one, which is near, exact equations are met if they
             # hold.
             with suppress(*NO_NUMBERS):
-                again = _Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS)
+                again = Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS)
                 return again if again.level < fit.level else fit
         return fit
 
-    def _begun(self, span: Span, beta: Array, known: Array) -> _Search:
+    def _begun(self, span: Span, beta: Array, known: Array) -> Search:
         """A search at the first level, from β (n,) or from the description, whichever leads nearer to the samples.
 
         From the description what loose equations do not determine is to stay near it.
         """
         searches = []
-        for start, reach in ((beta, None), described(self._model, self._base)):
+        value, size = described(self.model, self.base)
+        start_anew = np.concatenate((beta[: self.m], value)), np.concatenate((np.zeros(self.m), size))
+        for start, reach in ((beta, None), start_anew):
             with suppress(*NO_NUMBERS):
-                search = _Search(self, span, start, known, reach)
+                search = Search(self, span, start, known, reach)
                 search.loosen(LEVELS[0])
                 if search.mean_square <= LARGEST_MEAN_SQUARE:
                     return search
@@ -173,227 +100,3 @@ class SpanSmoother:
         if not searches:
             raise DivergedError("neither the balance's fit nor the description leads to the samples")
         return min(searches, key=lambda search: search.mean_square)
-
-    def dynamics(self, beta: Array) -> Dynamics:
-        """The equations of motion for β (n,)."""
-        return self._model.dynamics(self._base.physical_values(beta))
-
-
-class _Search:
-    """The state of a search: β and the motion, and what the last step was made of.
-
-    reach (n,): how far a step takes parameters that loose equations do not determine, as a standard deviation; 0 where
-    that is not known. before: see `SpanSmoother.fit`.
-    """
-
-    def __init__(
-        self, smoother: SpanSmoother, span: Span, beta: Array, known: Array, reach: Array | None = None,
-        before: Ending | None = None,
-    ) -> None:  # fmt: skip
-        self._before = before
-        self.reach = np.zeros(beta.size) if reach is None else reach
-        self._smoother, self._span, self._known = smoother, span, known
-        self._model, self._base = smoother._model, smoother._base
-        self.iterations = 0
-        self.beta = beta
-        self.std, self.factor = np.full(beta.size, np.inf), np.zeros((beta.size + 1, beta.size + 1))
-        self.mean_square = np.inf
-        self._asked, self._relaxation = np.zeros(beta.size), 1.0
-        t = span.nodes(ROUGH_STEP)
-        self.motion = Motion(t, *span.guess(t))
-        _, force = momenta_and_forces(smoother.dynamics(beta), self.motion.x, self.motion.v)
-        self._usual_force, self._usual_speed = _usual(force), _usual(self.motion.v)
-        if not self._has_mass(beta):
-            raise DivergedError("the first fit's mass matrix is not positive definite")
-        self._use_nodes()
-
-    def _use_nodes(self) -> None:
-        t = self.motion.t
-        self._innovations = Innovations(self._span, t, self._smoother._readings, self._smoother._sigma)
-        impulse = self._span.impulse
-        of_motors = self._model.generalized_force
-        middle = 0.5 * (t[1:] + t[:-1])
-        self._impulse, self._impulse_m = of_motors(impulse(t)), of_motors(impulse(middle))
-
-    def refine(self, step: float) -> None:
-        """Put the motion on nodes at no more than `step`, s."""
-        t = self._span.nodes(step)
-        old = self.motion
-        if t.size == old.t.size:
-            return
-        self.motion = Motion(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
-        self._use_nodes()
-
-    def through(self, levels: Sequence[float], steps: Sequence[float]) -> SpanFit:
-        """The fit, by way of white forces of so many levels."""
-        for level in levels:
-            self.loosen(level)
-        return self.tightened(steps)
-
-    def tightened(self, steps: Sequence[float]) -> SpanFit:
-        """The fit with equations that hold, or that hold as well as the samples allow."""
-        for k, step in enumerate(steps):
-            self.refine(step)
-            before = self.beta, self.motion
-            if not self.converge(0.0):
-                break
-            if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
-                break
-        for level in (0.0, *ALLOWED):
-            if level:
-                self.beta, self.motion = before
-                if not self.converge(level):
-                    continue
-            if self.mean_square <= LARGEST_MEAN_SQUARE:
-                return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step, self.ending)
-        raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
-
-    def loosen(self, level: float) -> None:
-        """Follow the samples with white forces of a level."""
-        for _ in range(MOST_TRIES):
-            self.advance(level)
-            if self.mean_square <= LARGEST_MEAN_SQUARE:
-                return
-
-    def converge(self, level: float) -> bool:
-        """Search until β converges or its steps scatter within its errors, in so many at most; whether it does."""
-        targets: list[Array] = []
-        with suppress(*NO_NUMBERS):
-            for _ in range(MAX_STEPS):
-                before = self.beta
-                self.advance(level, tame=False)
-                step = np.abs(self._asked)
-                if np.all(step <= CONVERGED * self.std):
-                    return True
-                targets = [*targets, before + self._asked] if np.all(step <= LONGEST_STEP * self.std) else []
-        if len(targets) >= FEWEST_TARGETS:
-            self.factor, self.beta = averaged(self.factor, targets[-FEWEST_TARGETS:])
-            self.std = np.sqrt(np.diag(solve(triangular_factor(self._known, self.factor)).covariance()))
-            return True
-        self.mean_square = np.inf
-        return False
-
-    def advance(self, level: float, tame: bool = True) -> None:
-        """One step of Gauss-Newton with white forces of a level, which `tame` ones bound by what they do to speeds."""
-        motion, base = self.motion, self._base
-        dynamics = self._smoother.dynamics(self.beta)
-        differences = self._innovations(motion.x, motion.v)
-        lacking = defects(dynamics, motion, self._impulse, self._impulse_m)
-        kalman = FixedIntervalSmoother(*self._first_state(dynamics))
-        every = max(1, round(DERIVATIVES_INTERVAL / motion.step))
-        nodes = every * max(1, 512 // every)
-        drive, joints = self._drive(dynamics, level, tame), self._smoother._motors.shape[1]
-        n_v = self._model.layout.n_v
-        rows, speeds = [], []
-        for start in range(0, len(motion.t), nodes):
-            piece = slice(start, start + nodes)  # and one more, which ends the last step
-            wide = slice(start, start + nodes + 1)
-            linear = linearise(dynamics, base, self._smoother._readings, motion.x[wide], motion.v[wide], every)
-            weights = self._innovations.weights[piece, :, None]
-            steps = transitions(linear, motion.step, drive, joints, lacking[piece])
-            count = len(weights)
-            speeds.append((linear.V[:count], linear.E[:count, :n_v, joints:]))
-            rows.append(kalman.push(differences[piece], weights * linear.C[:count], weights * linear.D[:count], steps))
-        innovations = np.concatenate(rows)
-        Y = -innovations[:, 1:]
-        self.rows = len(Y)
-        self.factor = triangular_factor(np.column_stack((Y, innovations[:, 0] + Y @ self.beta)))
-        delta, solution = self._step(level)
-        self._relax(delta)
-        beta = self._admissible(self.beta + self._relaxation * delta, solution, level > 0.0)
-        self._asked, delta = delta, beta - self.beta
-        self.mean_square = float(np.mean((innovations[:, 0] - Y @ delta) ** 2))
-        self.std = np.sqrt(np.diag(solution.covariance()))
-        s = kalman.smooth(delta)
-        # The motion is moved by its speeds, not by its momenta: of light coordinates momenta give the speeds badly.
-        moved = [
-            by_s @ s[k : k + len(by_s), :, None] + by_beta @ delta[:, None]
-            for k, (by_s, by_beta) in zip(range(0, len(s), nodes), speeds, strict=True)
-        ]
-        v = motion.v + np.concatenate(moved)[..., 0]
-        self.motion = Motion(motion.t, self._model.layout.displaced(motion.x, s[:, :n_v]), v)
-        self.beta = beta
-        self.ending = Ending(self.motion.x[-1], v[-1], beta, kalman.root, kalman.mean[:, 1:])
-        self.iterations += 1
-
-    def _relax(self, delta: Array) -> None:
-        """Shorten steps that go back on the last one, δβ (n,), and lengthen them again where they go on."""
-        along = (self.factor[:-1, :-1] @ delta) @ (self.factor[:-1, :-1] @ self._asked)
-        self._relaxation = (
-            max(LEAST_RELAXATION, 0.5 * self._relaxation) if along < 0.0 else min(1.0, 2.0 * self._relaxation)
-        )
-
-    def _first_state(self, dynamics: Dynamics) -> tuple[Array, Array]:
-        """Root (2 n_v, 2 n_v) and mean (2 n_v, 1 + n) of how far the first state is from the motion's.
-
-        As the span before leaves it, or free to move.
-        """
-        n_v, x, mass = self._model.layout.n_v, self.motion.x[:1], dynamics.mass_matrix(self.motion.x[:1])[0]
-        mean, before = np.zeros((2 * n_v, 1 + self._base.n)), self._before
-        if before is None:
-            root = np.diag(np.concatenate((np.full(n_v, FREE_POSITION), self._usual_speed)))
-            root[n_v:, n_v:] @= mass
-            return root, mean
-        momentum = self._smoother.dynamics(before.beta).mass_matrix(before.x[None])[0] @ before.v
-        mean[:n_v, 0] = self._model.layout.speeds(x, before.x - x)[0]
-        mean[n_v:, 0] = momentum - mass @ self.motion.v[0]
-        mean[:, 0] += before.by_beta @ (self.beta - before.beta)
-        mean[:, 1:] = before.by_beta
-        return before.root, mean
-
-    def _drive(self, dynamics: Dynamics, level: float, tame: bool) -> Array:
-        """What unit noise adds to the state in a step, (2 n_v, noises)."""
-        noise = self._smoother._motors
-        if level:
-            forces = self._tame_forces(dynamics) if tame else np.diag(self._usual_force)
-            noise = np.concatenate((noise, level * np.sqrt(CORRELATION) * forces), axis=1)
-        return np.concatenate((np.zeros_like(noise), np.sqrt(self.motion.step) * noise))
-
-    def _tame_forces(self, dynamics: Dynamics) -> Array:
-        """Root (n_v, n_v) of the covariance of forces that are as usual and change speeds by no more than is usual."""
-        H = dynamics.mass_matrix(self._sparse_motion()).mean(axis=0)
-        # Inverse variances of the two limits add up; as roots, since light coordinates make H ill conditioned.
-        of_forces = np.diag(1.0 / self._usual_force)
-        of_speeds = CORRELATION / MOST_SPEED * np.linalg.inv(H) / self._usual_speed[:, None]
-        return np.asarray(np.linalg.inv(np.linalg.qr(np.concatenate((of_forces, of_speeds)), mode="r")))
-
-    def _step(self, level: float) -> tuple[Array, Solution]:
-        """δβ (n,) of least squares, and the solution behind it; while equations are loose, within its reach."""
-        n = self._base.n
-        within = np.flatnonzero(self.reach) if level else np.arange(0)
-        damping = np.zeros((within.size, n + 1))
-        damping[np.arange(within.size), within] = 1.0 / self.reach[within]
-        damping[:, n] = damping[:, :n] @ self.beta
-        problem = triangular_factor(self._known, self.factor, damping)
-        problem[:, n] -= problem[:, :n] @ self.beta
-        size = np.linalg.norm(problem[:, :n], axis=0)
-        size[size == 0.0] = 1.0
-        return np.linalg.lstsq(problem[:, :n] / size, problem[:, n], rcond=RANK_TOLERANCE)[0] / size, solve(problem)
-
-    def _admissible(self, beta: Array, solution: Solution, loose: bool) -> Array:
-        """β; or the nearest consistent one while equations are loose, or as much of the step as leaves a mechanism.
-
-        Mass matrices are linear in β, so those that are positive definite make a convex set, which the search is in.
-        """
-        if loose:
-            with suppress(ArithmeticError):  # the projection is a help, no more
-                beta = self._smoother._physical.project(beta, solution.covariance()).beta
-        for _ in range(MOST_HALVINGS):
-            if self._has_mass(beta):
-                return beta
-            beta = 0.5 * (self.beta + beta)
-        raise DivergedError("a mass matrix is not positive definite")
-
-    def _has_mass(self, beta: Array) -> bool:
-        masses = self._smoother.dynamics(beta).mass_matrix(self._sparse_motion())
-        return bool(np.linalg.eigvalsh(masses).min() > 0.0)
-
-    def _sparse_motion(self) -> Array:
-        """Positions (B, n_x) every now and then."""
-        return self.motion.x[:: max(1, round(MASS_INTERVAL / self.motion.step))]
-
-
-def _usual(samples: Array) -> Array:
-    """rms of each column of samples (B, n_v), and no less than a share of the largest."""
-    rms = np.sqrt(np.mean(samples**2, axis=0))
-    return np.asarray(np.maximum(rms, LEAST_USUAL * rms.max()))

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sms_online.calibration.nuisance import Nuisance
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.model.readings import Readings, readable_channels
@@ -15,7 +16,9 @@ from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.sensing import Sensing, stated_noise
 from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
 from sms_online.pipeline.synchronise import GridSamples, Synchroniser
-from sms_online.smoother.fit import DivergedError, SpanFit, SpanSmoother
+from sms_online.smoother.fit import SpanSmoother
+from sms_online.smoother.nuisances import ReadingNuisances
+from sms_online.smoother.search import DivergedError, SpanFit
 from sms_online.smoother.span import Ending, Span
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block, Indices
@@ -44,7 +47,8 @@ class SmootherStatistics(NamedTuple):
     """What the spans so far have determined; nothing in it changes as the session goes on.
 
     failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square: of the
-    last span, see `SpanFit`; level: the largest of all. factor (n + 1, n + 1): square-root information about beta (n,).
+    last span, see `SpanFit`; level: the largest of all. factor (m + n + 1, m + n + 1): square-root information about
+    beta (m + n,), nuisances and parameters; tolerances (m,): of the nuisances.
     last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque. noisier:
     channels whose samples show more noise than is stated, and how many times as much, where no fit is taken otherwise.
     """
@@ -60,15 +64,24 @@ class SmootherStatistics(NamedTuple):
     last_step: float
     end: float
     lost: int
+    tolerances: Array
     noisier: tuple[tuple[str, float], ...] = ()
+
+    def beforehand(self, prior: Prior | None) -> Array:
+        """What is known of nuisances and parameters beforehand, as rows (·, m + n + 1)."""
+        m, n = self.tolerances.size, self.beta.size - self.tolerances.size
+        known = prior_factor(prior, n)
+        within = np.zeros((m, m + n + 1))
+        within[:, :m] = np.diag(1.0 / self.tolerances)
+        return np.concatenate((within, np.concatenate((np.zeros((len(known), m)), known), axis=1)))
 
     def estimate(self, prior: Prior | None) -> Estimate:
         """The base parameters, with what is known of them beforehand; only after the first span."""
         n = self.beta.size
-        problem = triangular_factor(prior_factor(prior, n), self.factor)
+        problem = triangular_factor(self.beforehand(prior), self.factor)
         problem[:, n] -= problem[:, :n] @ self.beta
         solution = solve(problem)
-        return Estimate(
+        estimate = Estimate(
             pi=self.beta.copy(),
             covariance=solution.covariance(),
             covariance_robust=None,
@@ -78,6 +91,7 @@ class SmootherStatistics(NamedTuple):
             rss=self.rss,
             dof=max(float(self.rows - solution.rank), 0.0),
         )
+        return estimate.without_nuisances(self.tolerances.size)
 
 
 class SmootherState(State):
@@ -113,9 +127,12 @@ class Smoother(Stage):
         self.channels = tuple(name for name in readable_channels(model) if name in available)
         self.prior: Prior | None = None
         self._synchroniser = Synchroniser([f"n_tau_{i}" for i in range(1, joints + 1)], self._rate)
-        nothing = np.zeros((base.n + 1, base.n + 1)), np.full(base.n, np.nan)
+        self._readings = ReadingNuisances(model, self.channels)
+        tolerances = np.array([each.tolerance for each in self.nuisances])
+        n = tolerances.size + base.n
+        nothing = np.zeros((n + 1, n + 1)), np.full(n, np.nan)
         self.state = SmootherState(
-            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf, 0),
+            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf, 0, tolerances),
             t=np.empty(0),
             values=np.empty((0, len(self.channels))),
             index=np.empty((0, 2), dtype=np.int64),
@@ -128,6 +145,11 @@ class Smoother(Stage):
     def set_prior(self, prior: Prior) -> None:
         """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior = prior
+
+    @property
+    def nuisances(self) -> tuple[Nuisance, ...]:
+        """What its readings may be off by."""
+        return self._readings.all
 
     @property
     def end(self) -> float:
@@ -218,15 +240,17 @@ class Smoother(Stage):
         values, sigma, torque_density = self._with_noise(now.t[inside], now.values[inside], now.torque[:count])
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
-        smoother = SpanSmoother(self._model, self._base, readings, sigma[sensed], torque_density)
+        noise = sigma[sensed], torque_density
+        smoother = SpanSmoother(self._model, self._base, readings, *noise, self._readings, sensed.tolist())
         try:
             if not moved.any():
                 raise DivergedError("the sensors give no motion to begin with")
             guess = self._guess(self._time(now.moved[moved]), now.motion[moved], now.t[inside], values)
             span = Span(torque_t, now.torque[:count], now.t[inside], values[:, sensed], *guess)
             past = now.known
-            beta = past.beta if past.spans else self._realisable(first_fit())
-            known = triangular_factor(prior_factor(self.prior, self._base.n), past.factor)
+            first = np.zeros(len(self.nuisances))
+            beta = past.beta if past.spans else np.concatenate((first, self._realisable(first_fit())))
+            known = triangular_factor(past.beforehand(self.prior), past.factor)
             fit = smoother.fit(span, beta, known, past.last_step if past.spans else None, now.ending)
         except DivergedError as error:
             if self._noisier(now.t[inside], now.values[inside]):
@@ -288,6 +312,7 @@ class Smoother(Stage):
             last_step=fit.step,
             end=end,
             lost=self._synchroniser.counters.lost_samples,
+            tolerances=past.tolerances,
             noisier=past.noisier,
         )
 

@@ -20,6 +20,8 @@ from sms_online.verdict.trust import Reason
 
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
+# Tolerances that are none of the smoother's readings.
+NOT_SMOOTHED = ("length", "axis", "gravity", "gauge_low_pass", "base_angle", "truncation", "drive_gain", "drive_offset")
 
 
 def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], troubles: Sequence[str]) -> Evidence:
@@ -123,8 +125,9 @@ def _weaknesses(now: Statistics) -> list[Reason]:
     if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
         # What acts there is no white force, and shifts parameters by more than white ones of its size would.
         out.append(Reason("samples do not agree with the equations of motion", True, then=DECLARE))
-    if by_smoother and any(value != 0.0 for value in now.setup.system.tolerances.model_dump().values()):
-        text = "the smoother's error bars do not include the tolerances of geometry and calibration"
+    tolerances = now.setup.system.tolerances.model_dump()
+    if by_smoother and any(tolerances[name] != 0.0 for name in NOT_SMOOTHED):
+        text = "the smoother's error bars do not include the tolerances of lengths, axes, gravity and drives"
         out.append(Reason(text, False, then=MEASURE_SLOPES))
     if now.momentum is None and not by_smoother:
         out.append(Reason("by the energy balance alone, nothing tests whether the model lacks something", False))
