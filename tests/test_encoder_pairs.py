@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sms_online as sms
+from sms_online.description.sources import LogSignal, TableSource
 
 SYSTEM = "paper-planar"  # springs that give way by a quarter of the motion
 GEAR = 50.0
@@ -66,3 +67,18 @@ def test_a_gear_ratio_that_no_spring_explains_is_named(capture: sms.Capture) -> 
     (remark,) = (remark for remark in found.remarks if "turns" in remark.text)
     assert remark.channel == "theta_m_1"
     assert "a gear ratio of 62.5 in place of 50, or a far softer spring" in remark.text
+
+
+def test_a_log_that_is_divided_by_another_gear_is_named(capture: sms.Capture) -> None:
+    system = sms.load_system(SYSTEM)
+    signals = {
+        "shaft": LogSignal(channel="theta_m_1", gear=40.0),
+        "torque": LogSignal(channel="tau_1", gear=GEAR),
+        "angle": LogSignal(channel="theta_m_2", gear=GEAR),
+        "link": LogSignal(channel="q_2", gear=3.0),
+    }
+    log = TableSource(kind="table", name="drives", signals=signals)
+    found = sms.check(system.model_copy(update={"sources": (log,)}), capture)
+    (remark,) = (remark for remark in found.remarks if "divided by" in remark.text)
+    assert remark.grave
+    assert str(remark.text) == "divided by a gear of 40, where joint_1 has a gear ratio of 50"

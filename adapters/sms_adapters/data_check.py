@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sms_adapters.channel_check import UNIT_TOLERANCE, ChannelCheck, Remark
-from sms_adapters.encoder_pairs import encoder_pairs
+from sms_adapters.encoder_pairs import encoder_pairs, other_gears
 from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channel_unit, drive_channels, sensed_channels
 from sms_online.description.given import Given, given_system
@@ -151,6 +151,7 @@ class ChannelChecks:
             self.checks.append(ChannelCheck(name, channel_unit(system, name), period, resolution))
         self._waiting = np.empty((0, len(self.channels)))
         self._pairs = encoder_pairs(system, self.channels)
+        self._gears = [remark for remark in other_gears(system) if remark.channel in self.channels]
         self._guard = StuckGuard([[k] for k in range(len(self.channels))])
 
     def push(self, block: Block) -> None:
@@ -188,6 +189,7 @@ class ChannelChecks:
             yield from check.remarks()
         for pair in self._pairs:
             yield from pair.remarks()
+        yield from self._gears
         # Where a sensor says how often it samples, its channels are compared with that, and remarked upon already.
         if (unit := self.other_unit_of_time) is not None and not self._described:
             period = min(period for check in self.checks if (period := check.measured_period))

@@ -1,7 +1,8 @@
-"""Two encoders of one flexible joint, on either side of its spring: do they turn alike?"""
+"""Gears in a description: do both encoders of a flexible joint turn alike, and do logs divide by its gear ratio?"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from sms_adapters.channel_check import Remark
 from sms_online.description.bodies import Joint
 from sms_online.description.schema import System
+from sms_online.description.sources import LogSource
 from sms_online.stream import Array
 
 # From this correlation on two readings are of one motion: a spring that is as soft as its link is heavy leaves less.
@@ -120,3 +122,14 @@ def encoder_pairs(system: System, channels: Sequence[str]) -> list[EncoderPair]:
         for i, joint in enumerate(system.joints, start=1)
         if {motor := f"theta_m_{i}", link := f"q_{i}"} <= set(channels)
     ]
+
+
+def other_gears(system: System) -> Iterator[Remark]:
+    """What a log's description divides by another gear than that of the joint."""
+    for source in system.sources:
+        for signal in source.signals.values() if isinstance(source, LogSource) else ():
+            found = re.fullmatch(r"(?:theta_m|tau)_(\d+)", signal.channel)
+            ratio = 1.0 if found is None else system.joints[int(found[1]) - 1].gear_ratio
+            if found is not None and signal.gear not in (1.0, ratio):
+                text = f"divided by a gear of {signal.gear:g}, where joint_{found[1]} has a gear ratio of {ratio:g}"
+                yield Remark(signal.channel, text, True)
