@@ -192,6 +192,10 @@ def test_a_can_log_needs_its_dbc(bench: Path, capsys: pytest.CaptureFixture[str]
         (("replay", "empty", "--system", "axis.toml"), "a folder that holds neither bag nor recording"),
         (("import", "pumps", "x.mat", "--capture", "new.csv"), "'pumps'"),
         (("import", "emps", "x.mat", "--capture", "new.csv"), "No such file"),
+        (
+            ("import", "emps", "x.mat", "--capture", "new.csv", "--beside", "run.csv"),
+            "--beside: run.csv; expected import",
+        ),
         (("markers", "--system", "paper-planar", "--modes", "0"), "a whole number, 1 or more"),
     ],
 )

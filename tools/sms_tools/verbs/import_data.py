@@ -26,6 +26,10 @@ Importer = Callable[[argparse.Namespace], tuple[int, list[str], list[str]]]
 
 def run(args: argparse.Namespace) -> int:
     """Write the capture and say how long it is, or the system file of a URDF."""
+    if args.beside is not None and args.kind != "points":
+        raise InputError(
+            f"import {args.kind}", "--beside", f"{args.beside}", "import points, which joins two recordings"
+        )
     if args.kind == "urdf":
         return _urdf(args)
     if args.capture is None:
