@@ -139,6 +139,14 @@ def test_a_motion_that_repeats_gives_no_clock(bench: tuple[System, sms.Capture],
         import_points(take, system, tmp_path / "run.csv", open_source(drives, system))
 
 
+def test_clocks_of_a_moment_are_not_compared(bench: tuple[System, sms.Capture], tmp_path: Path) -> None:
+    system, data = bench
+    moment = sms.Capture(data.t[:100], data.channels, data.values[:100])
+    take, drives = recorded(system, moment, tmp_path)
+    with pytest.raises(InputError, match="too short a recording to compare clocks"):
+        import_points(take, system, tmp_path / "run.csv", open_source(drives, system))
+
+
 def test_a_base_that_is_not_in_the_file_is_named(bench: tuple[System, sms.Capture], tmp_path: Path) -> None:
     system, data = bench
     take, _ = recorded(system, data, tmp_path)

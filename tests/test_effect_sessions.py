@@ -145,7 +145,7 @@ def test_reported_coefficients_are_those_that_were_injected(session: tuple[Syste
             elif injected is not None:
                 assert value == pytest.approx(injected, rel=0.01), (effect.name, name)
                 # Rows of a torque of unknown gain are weighted by what they leave, windows counted as they overlap.
-                assert 0.0 < std < 0.015 * abs(value)
+                assert 0.0 < std < 0.02 * abs(value)
 
 
 @pytest.mark.long

@@ -23,6 +23,8 @@ from sms_online.stream import Array, Block, Source
 
 # A shift explains the motion where it leaves less than this share of its variance: links bend.
 MOST_LEFT = 0.1
+# Shortest recording whose clock is compared, s.
+SHORTEST = 1.0
 # Instants that the arm is configured at in one call.
 TOGETHER = 4096
 
@@ -131,6 +133,9 @@ def _beside(place: str, system: System, seen: Block, drives: Source) -> tuple[Bl
 
 def _clock(place: str, system: System, seen: Block, recorded: Block) -> CameraClock:
     """The cameras' clock beside that of encoders, from the course of the points; InputError where they say none."""
+    if min(np.ptp(seen.t), np.ptp(recorded.t)) < SHORTEST:
+        expected = f"a motion of {SHORTEST:g} s or more in both"
+        raise InputError(place, "--beside", "too short a recording to compare clocks", expected)
     model = build_model(system)
     layout, points = model.layout, Points(system, model.chain)
     sensing = Sensing(model, (*seen.channels, *recorded.channels), place)

@@ -73,8 +73,9 @@ def shift_between(t_seen: Array, seen: Array, t: Array, expected: Array) -> Shif
         return np.stack([correlate(x[:, c], y[:, c], method="fft") for c in range(x.shape[1])])
 
     known_a, known_b = (np.isfinite(part).astype(float) for part in (a, b))
+    knowns = (a, known_a), (b, known_b)
     # Far from zero the sums of squares would be differences of large numbers.
-    a, b = (np.nan_to_num(part - np.nanmean(part, axis=0)) for part in (a, b))
+    a, b = (np.nan_to_num(part - np.nansum(part, axis=0) / known.sum(axis=0).clip(1)) for part, known in knowns)
     count = np.maximum(along(known_a, known_b), 1e-9)
     sum_a, sum_b = along(a, known_b), along(known_a, b)
     cross = (along(a, b) - sum_a * sum_b / count).sum(axis=0)

@@ -128,7 +128,7 @@ class NoiseBias(State):
         certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
         unit = size[-1] / size[:-1]
         shift[known] = kept @ (certain * whole) * unit
-        left = np.diag((1.0 - certain) * whole)
+        left = ((1.0 - certain) * whole)[:, None]
         spread = kept @ np.concatenate((parts, certain[:, None] * parts, left), axis=1)
         spread = np.concatenate((spread, directions[:, lost] * attenuated), axis=1) * unit[:, None]
         covariance[np.ix_(known, known)] = spread @ spread.T

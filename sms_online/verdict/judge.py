@@ -167,7 +167,8 @@ def _named(effects: Sequence[str], after: Trust, either: Sequence[Reason]) -> li
         ", except as listed below" if after.level == "doubt" else ""
     )
     text = f"the system file lacks {what}" + ("" if unsure else trusted)
-    then = "" if after.grave else reasons.GO_ON_WITH
+    # What else is to be done comes first.
+    then = "" if after.grave or after.next_step else reasons.GO_ON_WITH
     found = (
         [replace(each[0], text=text, then=then)] if len(each) == 1 else [Reason(text, after.grave, then=then), *each]
     )
