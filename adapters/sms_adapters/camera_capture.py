@@ -134,8 +134,8 @@ def _beside(place: str, system: System, seen: Block, drives: Source) -> tuple[Bl
 def _clock(place: str, system: System, seen: Block, recorded: Block) -> CameraClock:
     """The cameras' clock beside that of encoders, from the course of the points; InputError where they say none."""
     if min(np.ptp(seen.t), np.ptp(recorded.t)) < SHORTEST:
-        expected = f"a motion of {SHORTEST:g} s or more in both"
-        raise InputError(place, "--beside", "too short a recording to compare clocks", expected)
+        longer = f"a motion of {SHORTEST:g} s or more in both"
+        raise InputError(place, "--beside", "too short a recording to compare clocks", longer)
     model = build_model(system)
     layout, points = model.layout, Points(system, model.chain)
     sensing = Sensing(model, (*seen.channels, *recorded.channels), place)
@@ -151,8 +151,8 @@ def _clock(place: str, system: System, seen: Block, recorded: Block) -> CameraCl
     found = shift_between(seen.t, measured, t, expected)
     if found.left > MOST_LEFT:
         explained = f"markers whose motion the encoders explain to {100 * (1.0 - found.left):.0f} % at best"
-        expected_ = "the same motion: names of markers, axes with z up, signs and gears of encoders"
-        raise InputError(place, "--beside", explained, expected_)
+        same = "the same motion: names of markers, axes with z up, signs and gears of encoders"
+        raise InputError(place, "--beside", explained, same)
     if found.other is not None:
         several = f"a motion that repeats: t = 0 is {found.shift:.2f} or {found.other:.2f} s of the recording"
         raise InputError(place, "--beside", several, "one that does not, or whose beginning or end both hold")
