@@ -123,14 +123,21 @@ class NoiseBias(State):
         count = parts.shape[1]
         if count > 1:
             parts = (parts - parts.mean(axis=1, keepdims=True)) * np.sqrt(count / (count - 1.0))
+
+        def certain(whole: Array, parts: Array) -> Array:
+            """Share of a shift (k,) that is no scatter of its parts (k, C)."""
+            doubt = stdtrit(max(1, count - 1), EVIDENCE) ** 2 * np.sum(parts**2, axis=1)
+            return np.asarray(1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt))
+
         # Direction by direction: parameters that rows know together are shifted together.
-        doubt = stdtrit(max(1, count - 1), EVIDENCE) ** 2 * np.sum(parts**2, axis=1)
-        certain = 1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt)
         unit = size[-1] / size[:-1]
-        shift[known] = kept @ (certain * whole) * unit
-        left = ((1.0 - certain) * whole)[:, None]
-        spread = kept @ np.concatenate((parts, certain[:, None] * parts, left), axis=1)
-        spread = np.concatenate((spread, directions[:, lost] * attenuated), axis=1) * unit[:, None]
+        shift[known] = kept @ (certain(whole, parts) * whole) * unit
+        whole, parts = kept @ whole, kept @ parts
+        share = certain(whole, parts)
+        spread = np.concatenate(
+            (parts, share[:, None] * parts, np.diag((1.0 - share) * whole), directions[:, lost] * attenuated), axis=1
+        )
+        spread *= unit[:, None]
         covariance[np.ix_(known, known)] = spread @ spread.T
         return shift, covariance
 
