@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Sequence
 
 from sms_online.pipeline.latency import SourceGroup, clock_groups
 from sms_online.pipeline.sensing import Sensing
@@ -16,6 +17,17 @@ GAUGES, LINK_ENCODERS = "gauges", "link encoders"
 def reference_clock(sensing: Sensing) -> SourceGroup | None:
     """The device that the others are late against, which delivers torques; None where no devices are described."""
     return next((device for device in clock_groups(sensing) if device.joints), None)
+
+
+def clock_of(name: str, names: Sequence[str], base: Sequence[str]) -> str:
+    """The clock of a position sensor where no devices are described; names: of all, base: of those that see it."""
+    if name in base:
+        return "base"
+    if ".marker_" in name:
+        return "markers"
+    if name.endswith("strain_angle"):
+        return GAUGES
+    return LINK_ENCODERS if name.startswith("q_") and f"theta_m_{name[2:]}" in names else "encoders"
 
 
 def other_clocks(sensing: Sensing) -> dict[tuple[str, str], list[int]]:
@@ -37,9 +49,5 @@ def other_clocks(sensing: Sensing) -> dict[tuple[str, str], list[int]]:
         names = [sensing.channels[column] for column in sensing.position_columns]
         base = sensing.model.layout.n_base_positions
         for k, name in enumerate(names):
-            second = name.startswith("q_") and f"theta_m_{name[2:]}" in names
-            encoders = LINK_ENCODERS if second else "encoders"
-            rest = GAUGES if name.endswith("strain_angle") else encoders
-            kind = "base" if k < base else "markers" if MARKER.fullmatch(name) else rest
-            groups.setdefault((kind, ""), []).append(k)
+            groups.setdefault((clock_of(name, names, names[:base]), ""), []).append(k)
     return {name: sensors for name, sensors in groups.items() if sensors}

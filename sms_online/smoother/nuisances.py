@@ -15,6 +15,7 @@ from sms_online.description.sources import source_channels
 from sms_online.grouping import grouped
 from sms_online.model.model import Model
 from sms_online.model.points import Points
+from sms_online.pipeline.clocks import clock_of
 from sms_online.stream import Array
 
 MARKER = re.compile(r"link_\d+\.marker_\d+\.(?P<kind>u_|theta_)?[xyz]")
@@ -84,17 +85,8 @@ class ReadingNuisances:
                 if not any(channel.startswith(("tau_", "force_")) for channel in own)
             }
             return {name: own for name, own in apart.items() if own}
-
-        def kind(name: str) -> str:
-            if name in base:
-                return "base"
-            if MARKER.fullmatch(name):
-                return "markers"
-            second = name.startswith("q_") and f"theta_m_{name[2:]}" in names
-            return "link encoders" if second else "encoders" if ENCODER.fullmatch(name) else ""
-
-        found = grouped((kind(name), k) for k, name in enumerate(names))
-        return {name: list(own) for name, own in found.items() if name}
+        timed = (k for k, name in enumerate(names) if name in base or MARKER.fullmatch(name) or ENCODER.fullmatch(name))
+        return grouped((clock_of(names[k], names, base), k) for k in timed)
 
     def _zeros(self) -> Iterator[_Family]:
         tolerances = self._model.system.tolerances
