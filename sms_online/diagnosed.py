@@ -134,8 +134,9 @@ def diagnose(
     depends; without it blocks of the data, each predicted from the others. prior: as for `Session`. progress: is called
     with what is being done, a few words, and the share of all that is done, roughly. stop: is asked between steps
     whether to end with a partial verdict. learned: whether a curve may be named where no law of the catalogue is.
-    Raises InputError where the data cannot be read or do not fit the system, a coordinate is
-    not measured, parameters jump within the capture, or there is too little motion.
+    Where parameters jump within the capture, one part of it is searched.
+    Raises InputError where the data cannot be read or do not fit the system, a coordinate is not measured, or there is
+    too little motion.
     """
     system, folder = given_system(system)
     recorded, *others = [recorded_session(system, each, folder) for each in _several(data)]

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from sms_online.diagnosis.diagnose import diagnose
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.stream import Block
@@ -65,6 +66,17 @@ def test_a_payload_is_an_event_beside_friction(seed: int) -> None:
     mass = event.sizes[event.parameters.index("payload.mass")]
     assert mass == pytest.approx(MASS, rel=WITHIN)
     assert estimated_mass(estimator) == pytest.approx(MASS, rel=WITHIN)
+
+
+@pytest.mark.long
+def test_a_diagnosis_finds_the_payload_beside_friction() -> None:
+    """No effect is named for it: the part before it is diagnosed."""
+    capture = carrying(40.0, 1, MASS, 20.0)
+    (change,) = diagnose(described(), list(capture), "carrying", lambda estimator: None).changes
+    assert change.before
+    assert change.event.kind == "payload"
+    assert change.event.time == pytest.approx(20.0, abs=0.1)
+    assert change.event.sizes[0] == pytest.approx(MASS, rel=WITHIN)
 
 
 @pytest.mark.long

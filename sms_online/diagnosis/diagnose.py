@@ -11,6 +11,7 @@ from sms_online.calibration.found import Calibration
 from sms_online.description.schema import System
 from sms_online.diagnosis.attempt import FITTED_ONCE, SEARCHED, TRACED, Attempt, Case, Part, PriorOf, Progress
 from sms_online.diagnosis.calibrated import covered
+from sms_online.diagnosis.capture_changes import diagnosed_part, find_change
 from sms_online.diagnosis.captures import begins, in_seconds, one_after_another, undone
 from sms_online.diagnosis.drifts import explained_by_drifts, following, leaves_more, leaves_unexplained, may_explain
 from sms_online.diagnosis.exact_links import with_exact_links
@@ -32,6 +33,7 @@ from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import kinematic_candidates
 from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.row_types import LARGEST_RESIDUAL
 from sms_online.stream import Block
@@ -94,6 +96,10 @@ def diagnose(
         noise = _noise(before, source)
         case = replace(case, session=before, noise=noise, segments=record.segments(), held=held)
         case, attempt = _first(case, system)
+    rest = case, runs, holdout, mistakes, zeros
+    jump = find_change(attempt, before.start_time) if len(runs) == 1 and attempt.tracing.exceeds else None
+    if jump is not None:
+        return _part_of(*rest, jump)
     followed = before
     described = attempt
     # From one capture to the next parameters may change at once.
@@ -167,8 +173,10 @@ def diagnose(
         said = "named"
     # With what was found constant parameters explain the capture, though its session may take what a law is inexact by
     # for a change. What a change does not explain may only look like one.
-    if not partial and said != "named" and not leaves_unexplained(before):
-        _check_unchanged(before, source)
+    if not partial and said != "named" and len(runs) == 1:
+        jump = _jump(before, attempt, chosen, said == "unexplained" and not noisy)
+        if jump is not None:
+            return _part_of(*rest, jump)
     grave = said == "clean" and now.trust.grave
     # What is left unexplained takes such numbers anywhere.
     calibration = () if said == "unexplained" and not noisy else _miscalibrated(now, noisy and not named)
@@ -201,6 +209,34 @@ def diagnose(
     )
 
 
+def _jump(session: Estimator, attempt: Attempt, chosen: Sequence[int], unexplained: bool) -> Event | None:
+    """A jump of parameters that a session has found, or that explains what is left beside the effects chosen."""
+    jumps = [] if leaves_unexplained(session) else [event for event in session.events if event.parameters]
+    if jumps or not unexplained:
+        return jumps[0] if jumps else None
+    return find_change(attempt, session.start_time, chosen)
+
+
+def _part_of(
+    case: Case,
+    runs: Sequence[Sequence[Block]],
+    holdout: Sequence[Block],
+    mistakes: tuple[Mistake, ...],
+    zeros: Sequence[TorqueZero],
+    event: Event,
+) -> Search:
+    """What a capture holds before a jump of parameters, or behind it where that is far longer."""
+    # No window of either part holds the jump.
+    part, change = diagnosed_part(runs[0], event, case.session.system.windows.momentum)
+    case.progress(change.sentence, FITTED_ONCE)
+    found = diagnose(
+        case.session.system, part, case.source, case.prior, holdout, case.progress, case.stop, case.learned
+    )
+    return replace(
+        found, mistakes=(*mistakes, *found.mistakes), zeros=[*zeros, *found.zeros], changes=(change, *found.changes)
+    )
+
+
 def _first(case: Case, system: System) -> tuple[Case, Attempt]:
     """The system against a case's samples, and the case, with the prior or without it.
 
@@ -216,16 +252,6 @@ def _first(case: Case, system: System) -> tuple[Case, Attempt]:
     if attempt.tracing.exceeds or case.prior(case.session) is None:
         return alone, attempt
     return case, Attempt(case, system)
-
-
-def _check_unchanged(session: Estimator, source: str) -> None:
-    """Raise InputError where parameters change within a capture."""
-    # Windows that nothing explained are a diagnosis's own affair; a change of parameters is not.
-    changes = [event for event in session.events if event.parameters]
-    if changes:
-        event = changes[0]
-        expected = "a part without it: -ss or -to"
-        raise InputError(source, f"{event.time:.2f} s", f"an event ({event.kind}) within the capture", expected)
 
 
 def _drifting(

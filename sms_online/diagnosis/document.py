@@ -16,13 +16,13 @@ from sms_online.diagnosis.reported import Coefficients
 from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.torque_zeros import HELD_OUT
 from sms_online.effects.catalogue import ENTRIES, declarable, either, in_words, traits_of
-from sms_online.result import residual_document, result_of
+from sms_online.result import event_document, residual_document, result_of
 from sms_online.row_types import Residual
 from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import at_noise, judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
-from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, THEN_DIAGNOSE, undecided
+from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, REPLAY_WHOLE, THEN_DIAGNOSE, undecided
 from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -74,6 +74,7 @@ def diagnosis_document(
             }
             for zero in diagnosis.zeros
         ],
+        "changes": [{**event_document(each.event), "sentence": each.sentence} for each in diagnosis.changes],
         "calibration": [
             {**each.document(), "sentence": str(each), "next_step": each.advice} for each in diagnosis.calibration
         ],
@@ -118,6 +119,7 @@ def diagnosis_document(
         "warnings": [
             *warnings,
             *(zero.sentence for zero in diagnosis.zeros),
+            *(change.sentence for change in diagnosis.changes),
             # Those of a session are of its parameters, which are not those reported where these come from rows.
             *(_after(diagnosis, sessions["after"]).warnings if given else sessions["after"].warnings),
         ],
@@ -144,7 +146,15 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
 
     after: the evaluation of the session with what was found, where it is at hand.
     """
-    after = evaluated(diagnosis.estimator_after) if after is None else after
+    trust = _of_part(diagnosis, evaluated(diagnosis.estimator_after) if after is None else after)
+    if not diagnosis.changes:
+        return trust
+    jumps = [Reason(each.sentence, False, each.places, "a jump", then=REPLAY_WHOLE) for each in diagnosis.changes]
+    return Trust("doubt", (*jumps, *(trust.grounds if trust.level != "trust" else ())), grave=trust.grave)
+
+
+def _of_part(diagnosis: Search, after: JudgedEvaluation) -> Trust:
+    """May they be trusted for the part that was diagnosed?"""
     effects = [effect.key for effect in _named(diagnosis)]
     row = None if diagnosis.unexplained is None else diagnosis.unexplained.row
     rest, learned = _after(diagnosis, after), diagnosis.attempt.case.learned
@@ -168,10 +178,16 @@ def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:
 
 
 def summary(diagnosis: Search) -> str:
-    """The verdict in a sentence, after one for each mistake."""
-    if not diagnosis.partial:
-        return _whole(diagnosis)
+    """The verdict in a sentence, after one for each jump of parameters and each mistake."""
+    jumps = "".join(f"{each.sentence[:1].upper()}{each.sentence[1:]}. " for each in diagnosis.changes)
+    return f"{jumps}{_of_search(diagnosis)}"
+
+
+def _of_search(diagnosis: Search) -> str:
+    """The same of the part that was diagnosed."""
     said = _whole(diagnosis)
+    if not diagnosis.partial:
+        return said
     if _undecided_yet(diagnosis):
         # What was not tried yet is not ruled out.
         found = ", ".join(_named_in_words(diagnosis, effect) for effect in _named(diagnosis))

@@ -9,6 +9,7 @@ from functools import cached_property
 from sms_online.calibration.found import Calibration
 from sms_online.diagnosis.attempt import Attempt, ModelFit, Step
 from sms_online.diagnosis.candidate import Finding, Ranked
+from sms_online.diagnosis.capture_changes import CaptureChange
 from sms_online.diagnosis.hypothesis import share_left
 from sms_online.diagnosis.late_sensors import LateSensor
 from sms_online.diagnosis.mistakes import Mistake
@@ -34,7 +35,7 @@ class Search:
     described, attempt: first and last description against the samples; chosen: of the last one's candidates.
     estimator_before, estimator_after: sessions of the two systems over the whole capture; the first one again where the
     search is partial or parameters come from its own rows. drifts: parameters that drift, which the second follows;
-    nothing else is searched then.
+    nothing else is searched then. changes: jumps of parameters in the capture; all else is of one part of it.
     """
 
     verdict: str
@@ -55,6 +56,7 @@ class Search:
     estimator_after: Estimator
     unexplained: Unexplained | None
     drifts: tuple[Drift, ...] = ()
+    changes: tuple[CaptureChange, ...] = ()
 
     @property
     def left(self) -> float:

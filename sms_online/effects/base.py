@@ -105,7 +105,9 @@ class Entry:
 
     @property
     def change(self) -> str:
-        """Kind of an event in which its coefficients jump, by the last word of its name."""
+        """Kind of an event in which its coefficients jump, by its place or the last word of its name."""
+        if self.at == "tip":
+            return "payload"
         word = self.name.rsplit("_", 1)[-1]
         return word if word in CHANGES else "inertia"
 

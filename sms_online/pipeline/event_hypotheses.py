@@ -43,6 +43,8 @@ CERTAIN = 5.0
 # A column of which the others leave less than this share cannot jump alone.
 FREE = 1e-6
 
+# Kind of an event in which a body is grasped or released.
+PAYLOAD = "payload"
 # Kinds of events by the ends of the parameter that jumped.
 KINDS = {"stiffness": ("stiffness", "rigidity", "rigidity_y", "rigidity_z"), "damping": ("damping",)}
 
@@ -132,7 +134,7 @@ def hypotheses(parameters: tuple[Parameter, ...]) -> list[Jump]:
     """
     names = [p.name for p in parameters]
     out = [Jump(kind_of([name]), (k,)) for k, name in enumerate(names)]
-    out.sort(key=lambda jump: jump.kind != "payload")
+    out.sort(key=lambda jump: jump.kind != PAYLOAD)
     groups: dict[str, list[int]] = {}
     for k, name in enumerate(names):
         owner = name.rsplit(".", 1)[0]
@@ -148,7 +150,7 @@ def kind_of(names: list[str]) -> str:
     """Kind of an event in which these parameters jumped."""
     name = names[0]
     if name.startswith("payload."):
-        return "payload"
+        return PAYLOAD
     if "@" in name:
         return ENTRIES[name.split("@")[0]].change
     return next((kind for kind, ends in KINDS.items() if name.endswith(ends)), "inertia")

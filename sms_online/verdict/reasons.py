@@ -35,6 +35,7 @@ ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it 
 THEN_DIAGNOSE = ", then run `sms-online diagnose`"
 IF_NOTHING = f"{DIAGNOSE}; where it finds nothing, and "
 GO_ON_WITH = "go on with the system.toml that was written, and check it on another run: `sms-online validate`"
+REPLAY_WHOLE = "replay the whole capture with the system.toml that was written: a session goes on behind the jump"
 DESCRIBE = "describe what acts there, or let a curve be learned: `sms-online diagnose --learn`"
 NO_CURVE = "no learned curve explains it either: look at what acts there, and at the sensors of these rows"
 CHECK_TORQUE = f"check sign, unit and gear ratio of that torque{THEN_DIAGNOSE}"
