@@ -13,6 +13,7 @@ import pytest
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import Effect, System
+from sms_online.description.sources import LogSignal, TableSource
 from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.document import diagnosis_document
 from sms_online.diagnosis.mistakes import Corrected, find_mistakes, wrong_clock
@@ -157,6 +158,16 @@ def test_a_sliding_axis_is_a_length_and_a_wrench_is_neither_length_nor_angle() -
     resting[:, 1] = np.linspace(0.0, 1.0, 5000)
     resting[:2500, 5] = np.random.default_rng(6).standard_normal(2500)
     assert list(shown(channels, [Segment(np.arange(5000), resting)])) == []
+
+
+def test_a_log_may_hold_radians_where_degrees_are_stated() -> None:
+    signals = {"Q1": LogSignal(channel="q_1", unit="deg"), "Q2": LogSignal(channel="q_2", unit="mrad")}
+    log = TableSource(kind="table", name="drives", signals=signals)
+    system = stated().model_copy(update={"sources": (log,)})
+    (found,) = (each for each in mistake_hypotheses(system, ("q_1", "q_2")) if each.name == "converted")
+    assert found.where == "q_1"
+    assert found.sentence == "q_1 is in rad, where the system file states deg"
+    np.testing.assert_allclose(found.apply(("q_1", "q_2"), np.deg2rad(np.eye(2)))[:, 0], [1.0, 0.0])
 
 
 @pytest.mark.long

@@ -11,12 +11,15 @@ import numpy as np
 
 from sms_online.description.channels import channel_unit
 from sms_online.description.schema import System
+from sms_online.description.sources import LogSource
 from sms_online.diagnosis.record import Segment
 from sms_online.grouping import grouped
 from sms_online.sample_faults import stuck_samples, wrapped_at
 from sms_online.stream import Array, Mask
 
 DEGREE = math.pi / 180.0
+# How a log's description names the units that are confused with SI, with what a number in SI is then divided by.
+CONFUSED = {"deg": DEGREE, "degree": DEGREE, "degrees": DEGREE, "mm": 1e-3, "millimeter": 1e-3, "millimetre": 1e-3}
 # Values that repeat in runs of at least this length, most of which are equal, are those of a held command.
 HELD_RUN, MOST_RUNS = 3, 0.8
 # A reading that moves by less than this share of what it usually does is at rest.
@@ -65,6 +68,7 @@ def mistake_hypotheses(system: System, channels: Sequence[str]) -> Iterator[Mist
     positions = _positions(channels)
     yield from _signs(positions)
     yield from _units(system, positions)
+    yield from _converted_twice(system, positions)
     yield from _geared(system, channels)
     yield from _swaps(channels)
 
@@ -134,6 +138,22 @@ def _units(system: System, positions: Sequence[str]) -> Iterator[MistakeHypothes
         if len(all_of) > 1:
             said = f"{words} {text.replace('is', 'are', 1)}"
             yield MistakeHypothesis(name, words, said, f"multiply them by {factor:.4g}", scaled(all_of, factor))
+
+
+def _converted_twice(system: System, positions: Sequence[str]) -> Iterator[MistakeHypothesis]:
+    """Numbers of a log that are in SI, described as in degrees or millimetres."""
+    stated: dict[str, list[str]] = {}
+    for source in system.sources:
+        for signal in source.signals.values() if isinstance(source, LogSource) else ():
+            if signal.unit in CONFUSED and signal.channel in positions:
+                stated.setdefault(signal.unit, []).append(signal.channel)
+    for unit, names in stated.items():
+        factor = 1.0 / CONFUSED[unit]
+        for where, group in {**{name: [name] for name in names}, **_groups(names)}.items():
+            own = channel_unit(system, group[0])
+            said = f"{where} is in {own}, where the system file states {unit}"
+            then = f'state unit = "{own}" for {where}, or multiply by {factor:.4g} what was read'
+            yield MistakeHypothesis("converted", where, said, then, scaled(group, factor))
 
 
 def _geared(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
