@@ -21,6 +21,8 @@ from sms_online.trackers.interface import Prior, prior_factor
 # Rows whose mean square exceeds their variance by more than this although everything that is known of has been
 # subtracted have an error of their own: friction is never quite its model.
 LARGEST_RATIO = 1.5
+# They exceed it by little where each type leaves less than this times its variance beyond it.
+LITTLE_MORE = 15.0
 # With variance that is yet to be added they clearly do where so many times as much would be left.
 CLEARLY = 4.0
 # Where they do not, and this share of what is beyond noise without the candidates is left with all of them, what is
@@ -135,9 +137,9 @@ class CandidateRows(CandidateFits):
         self._own, self._free = own, free
         self._whiten()
         # Rows that leave more than noise even so are uncertain by that: what the laws do not determine there would grow
-        # with their coefficients, and these with it.
+        # with their coefficients, and these with it. Not so by little more, as noise of torques that has a memory does.
         exceeding = (self.floor > 0.0) & np.any(wanted, axis=0)
-        if np.any(exceeding):
+        if np.any(exceeding) and self.floor.max() > LITTLE_MORE:
             own[:, exceeding], free[..., exceeding] = 0.0, 0.0
             self._exceeding = frozenset(chosen), exceeding
             self._whiten()
