@@ -78,6 +78,11 @@ def test_noise_beside_a_jitter_is_estimated() -> None:
     assert noise_beside(left[:, 0], rates[:, 0], 5e-4) == pytest.approx(NOISE, rel=0.2)
 
 
+def test_a_channel_at_rest_has_no_noise_beside_a_jitter() -> None:
+    """An encoder whose last digit does not move."""
+    assert noise_beside(np.zeros(50), np.zeros(50), 1e-4) < 1e-100
+
+
 @pytest.mark.parametrize("wobble", [0.0, 1e-4])
 def test_noise_is_no_jitter(wobble: float) -> None:
     """Neither that of each channel nor that of all of them."""

@@ -142,7 +142,8 @@ def noise_beside(left: Array, rates: Array, jitter: float) -> float:
     of_jitter = (jitter * rates) ** 2
     variance = float(np.mean(left**2))
     for _ in range(PASSES):
-        weight = (variance + of_jitter) ** -2.0
+        expected = variance + of_jitter
+        weight = (expected.min() / expected) ** 2
         variance = max(float(np.sum(weight * (left**2 - of_jitter)) / np.sum(weight)), np.finfo(np.float64).tiny)
     return float(np.sqrt(variance))
 
