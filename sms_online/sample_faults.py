@@ -20,6 +20,9 @@ LEAST_RUN = 8
 # A coarse encoder that turns back rests too, but creeps there by single steps; what stops from a change of more
 # than this many of its smallest steps has stopped all at once.
 SUDDEN = 3.0
+# Friction stops a fine encoder from several steps, too, but not from a change of more than this multiple of what its
+# changes usually differ by from one to the next, rms.
+USUAL_STOP = 5.0
 # Turns at which readings wrap, in rad and degrees: a step within this share of one, where others are far smaller.
 TURNS, TURN_TOLERANCE = (2.0 * np.pi, np.pi, 360.0), 0.1
 # A reading that wraps elsewhere steps by more than this multiple of its usual steps, every time by the same within
@@ -99,6 +102,7 @@ class StuckGuard:
         self._quantum = np.full(channels, np.inf)  # size of the smallest change
         self._seen = np.zeros(channels, dtype=np.int64)
         self._repeated = np.zeros(channels, dtype=np.int64)
+        self._bends = np.zeros(channels)  # sum of squares of what changes differ by from one to the next
 
     def blank(self, values: Array, new: int) -> None:
         """Blank, in place, what is stuck in rows (K, C), of which the last `new` are seen for the first time."""
@@ -113,6 +117,7 @@ class StuckGuard:
             if whole and changes.all():
                 # Everything moved all the time, NaN before the first sample included.
                 self._quantum[group] = np.fmin(self._quantum[group], np.fmin.reduce(changes, axis=0))
+                self._bends[group] += _bends(changes, self._change[group])
                 self._last[group], self._run[group] = values[rows[-1], group], 0
                 self._change[group] = changes[-1]
                 self._seen[group] += rows.size
@@ -134,7 +139,9 @@ class StuckGuard:
         run = np.where(changed >= 0, number - changed, number + 1 + self._run[channel])
         size = np.where(changed >= 0, change[changed], self._change[channel])
         limit = self._limit(channel)
-        stuck = (run >= limit) & (size > SUDDEN * self._quantum[channel])
+        stuck = (run >= limit) & (size > self._sudden(channel))
+        if not stuck.any():
+            self._bends[channel] += _bends(change, self._change[channel])
         self._last[channel], self._run[channel] = samples[-1], run[-1]
         self._change[channel] = size[-1]
         # What is stuck teaches nothing about the sensor's ways.
@@ -149,9 +156,19 @@ class StuckGuard:
         self.blanked[channel] += np.count_nonzero(stuck)
         column[rows[stuck]] = np.nan
 
+    def _sudden(self, channel: int) -> float:
+        """The largest change from which the sensor may come to rest all at once."""
+        usual = np.sqrt(self._bends[channel] / max(1, self._seen[channel])) if self._repeated[channel] else 0.0
+        return float(max(SUDDEN * self._quantum[channel], USUAL_STOP * usual))
+
     def _limit(self, channel: int) -> int:
         """Repetitions in a row that are an alarm."""
         if self._seen[channel] < LEARNT:
             return int(np.iinfo(np.int64).max)
         share = (self._repeated[channel] + 1.0) / (self._seen[channel] + 2.0)
         return max(LEAST_RUN, int(np.ceil(np.log(FALSE_ALARM) / np.log(share))))
+
+
+def _bends(changes: Array, before: Array | float) -> Array:
+    """Sum of squares of what changes (B, ...) differ by from one to the next, the first from that before."""
+    return np.asarray(np.nansum(np.diff(changes, axis=0, prepend=np.asarray(before)[None]) ** 2, axis=0))

@@ -267,3 +267,20 @@ def test_a_stuck_sensor_is_noticed_but_no_coarse_encoder() -> None:
     assert guard.blanked.tolist() == [499, 0]
     assert np.isnan(values[2001:2500, 0]).all()
     assert not np.isnan(values[2500:, 0]).any()
+
+
+def test_an_axis_that_friction_stops_is_not_stuck() -> None:
+    """A fine encoder stops from several counts there; stuck at full speed it stops from far more."""
+    t = np.arange(8000) / 500.0
+    speed = np.clip(20.0 * np.abs(np.sin(2.0 * t)) - 3.0, 0.0, 3.0) * np.sign(np.sin(2.0 * t))
+    count = 2.0 * np.pi / 131072
+    angle = np.round(np.cumsum(speed) / 500.0 / count) * count
+    healthy, stuck = angle[:, None].copy(), angle[:, None].copy()
+    begin = int(np.argmax(np.abs(speed[6000:7000]))) + 6000
+    stuck[begin : begin + 200] = stuck[begin]
+    for values in (healthy, stuck):
+        guard = StuckGuard([(0,)])
+        for k in range(0, t.size, 50):
+            guard.blank(values[: k + 50], 50)
+    assert np.isfinite(healthy).all()
+    assert np.flatnonzero(np.isnan(stuck[:, 0])).tolist() == list(range(begin + 1, begin + 200))
