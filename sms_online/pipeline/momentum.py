@@ -266,6 +266,9 @@ class Momentum(Stage):
                 found = self.changes.decide(noise, self.state.start_time, last)
         if isinstance(found, Adoption):
             self.adopt(found, noise)
+            if last:
+                # The samples behind the event are the last of their segment.
+                self._absorb(self.fit.end_segment(noise))
         self._take_back()
 
     def _take_back(self) -> None:
