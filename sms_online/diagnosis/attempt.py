@@ -189,14 +189,14 @@ class Attempt(Hypothesis):
         states = build_model(system.model_copy(update={"effects": forces})).n_states
         return Attempt(self.case, system, constants, beta, effects, LONGEST if states else SOME, self.rows.second_order)
 
-    @property
-    def by_rows(self) -> bool:
-        """Whether parameters are those of these rows, and not those of a session with what was found.
+    def by_rows(self, chosen: Sequence[int]) -> bool:
+        """Whether parameters are those of these rows, and not those of a session with those chosen.
 
-        So they are with a prior that these heed; without any prior, where rows without a torque leave more than noise:
-        nothing says then at which scale a session ends.
+        So they are with a prior that these heed; without any prior, where rows without a torque leave far more than
+        noise: nothing says then at which scale a session ends.
         """
-        return self.prior is not None or (self.tracing.exceeds and self._known is None)
+        self.tracing.weigh(chosen)
+        return self.prior is not None or (self.tracing.exceeds_by_much and self._known is None)
 
     def watch(self, chosen: Sequence[int]) -> bool:
         """See `Hypothesis`."""

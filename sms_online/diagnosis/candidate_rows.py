@@ -139,7 +139,7 @@ class CandidateRows(CandidateFits):
         # Rows that leave more than noise even so are uncertain by that: what the laws do not determine there would grow
         # with their coefficients, and these with it. Not so by little more, as noise of torques that has a memory does.
         exceeding = (self.floor > 0.0) & np.any(wanted, axis=0)
-        if np.any(exceeding) and self.floor.max() > LITTLE_MORE:
+        if np.any(exceeding) and self._by_much:
             own[:, exceeding], free[..., exceeding] = 0.0, 0.0
             self._exceeding = frozenset(chosen), exceeding
             self._whiten()
@@ -307,6 +307,15 @@ class CandidateRows(CandidateFits):
     def exceeds(self) -> bool:
         """Whether rows leave more than noise whatever is added, so that those without a torque count by their size."""
         return self._scale.exceeds
+
+    @property
+    def exceeds_by_much(self) -> bool:
+        """Whether they leave far more, so that nothing says at which scale a fit that counts noise alone ends."""
+        return self.exceeds and self._by_much
+
+    @property
+    def _by_much(self) -> bool:
+        return bool(self.floor.max() > LITTLE_MORE)
 
     def put(self, k: int, candidate: Candidate) -> None:
         """Put another form of an effect in the place of a candidate."""

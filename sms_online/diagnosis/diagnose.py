@@ -151,7 +151,7 @@ def diagnose(
     partial, estimator_after = stop(), before
     # Where parameters come from the rows of the diagnosis, no other session has any to give.
     what = "fitting the model with what was found"
-    while after.system != system and not partial and not attempt.by_rows:
+    while after.system != system and not partial and not attempt.by_rows(chosen):
         estimator_after, _ = _session(
             after.system, runs, source, prior, lambda share: progress(what, SEARCHED + (1.0 - SEARCHED) * share)
         )

@@ -63,13 +63,13 @@ class Search:
         """Share of what was beyond noise that is left with what was found."""
         return share_left(self.before.excess, self.after.excess)
 
-    @property
+    @cached_property
     def by_rows(self) -> bool:
         """Whether parameters after are those of the diagnosis's rows, and not of a session; see `Attempt.by_rows`.
 
         Where nothing was found those of the session as described are, which knows more of its sensors' noise.
         """
-        return (self.partial or self.attempt.by_rows) and self.after.system != self.estimator_before.system
+        return (self.partial or self.attempt.by_rows(self.chosen)) and self.after.system != self.estimator_before.system
 
     @cached_property
     def model(self) -> Model:
