@@ -22,7 +22,7 @@ from sms_online.diagnosis.weak_windows import SeenMotion
 from sms_online.effects.build import declaring
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.pipeline.smoothing import smooth
-from sms_online.pipeline.standstill import rate_filter, slowest
+from sms_online.pipeline.standstill import Standstill, rate_filter, slowest
 from tests.axis_effects import SYSTEM, axis_block, nothing
 from tests.sessions_of import session_of
 
@@ -135,6 +135,18 @@ def test_an_axis_is_at_rest_where_its_rate_is_noise_for_long(noise: float) -> No
     assert leaving[(seen > edges[3] * 1000.0 - 20) & still & (seen > 2000)] == pytest.approx(-1.0)
     assert np.sum(np.abs(leaving)) == 50
     assert not np.any(leaving[~still])
+
+
+def test_an_axis_turns_back_where_its_rate_changes_its_sign() -> None:
+    """From 1 to −0.2 rad/s² at 0.5 s, as friction does it, and not where the rate only comes near to zero."""
+    t = np.arange(1500) / 1000.0
+    rate = np.where(t < 0.5, 0.5 - t, 0.2 * (0.5 - t)) * np.where(t < 1.0, 1.0, np.abs(t - 1.2) + 0.3)
+    position = np.cumsum(rate)[:, None] / 1000.0
+    axis = Standstill(1, 1000.0)
+    axis.push(position, np.array([1e-9]))
+    found = np.flatnonzero(axis.turning(np.arange(100, 1400))[:, 0]) + 100
+    assert found.size == 2
+    assert t[found] == pytest.approx([0.5, 0.501], abs=0.004)
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-5, 1e-4])

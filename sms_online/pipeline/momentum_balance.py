@@ -281,10 +281,11 @@ class MomentumBalance(Stage):
             places[:, None] == self.rough.dry for places in (self._physical[self._rough], self.rough.coefficients)
         ]
         out = []
-        seen = self._sampling.seen(kept, half_width, windows, self._rough_columns)
-        for window, row, values in zip(windows, rows, seen, strict=True):
+        sampled = self._sampling.seen(kept, half_width, windows, self._rough_columns)
+        for window, row, values in zip(windows, rows, sampled, strict=True):
             columns, slopes, breaking = np.split(values, parts, axis=1)
-            still = self._standstill.at(np.arange(window, window + self.width + 1) + self.lead)[:, axis_of]
+            samples = np.arange(window, window + self.width + 1) + self.lead
+            still, turning = (seen(samples)[:, axis_of] for seen in (self._standstill.at, self._standstill.turning))
             moving, both = (~(still @ law.T) for law in by_law)
             columns = columns.reshape(len(columns), COPIES, -1).copy()
             columns[..., : self._rough.size] *= moving[:, None]
@@ -296,7 +297,7 @@ class MomentumBalance(Stage):
             if self.with_moments:
                 moment[self._rough] = -self._moment_phi[1][0] @ columns[:, 0, : self._rough.size]
             rough = responses(slopes, phi * self.sample_rate, half_width, self.sample_rate, STEPS)
-            rest = stiction_std(breaking, still, phi)
+            rest = stiction_std(breaking, still | turning, phi)
             out.append(replace(row, Y=Y, b=row.b - weak[:, self._rough.size :], rough=rough, rest=rest, moment=moment))
         return out
 

@@ -27,6 +27,9 @@ DIFFERENCE = 1e-6
 WITHIN = (-0.4, -0.2, 0.0, 0.2, 0.4)
 # Rate of an axis that moves off, rad/s (m/s): beyond what a sign is smoothed by, within what friction falls by.
 MOVING_OFF = 10.0 * STANDSTILL
+# Variance of friction where an axis turns back, over the square of breakaway: its mean is not zero, and rows are not to
+# show it.
+TURNING_BACK = 10.0
 
 
 class RoughForces:
@@ -146,13 +149,23 @@ def stiction_std(breaking: Array, still: Mask, phi: Array) -> Array:
     """Standard deviation (INSTANTS, D) of the integrals of forces where their axes rest, a half hop at a time.
 
     As of a force that is another at each sample, so that nothing predicts its course; over a window, all of which
-    its axis rests in, as large as breakaway, which is more than it can be. breaking (width + 1, D):
-    `RoughForces.breaking` along the window. still (width + 1, D): whether the axis rests. phi (width + 1,): weights of
-    the integral.
+    its axis rests in, as large as breakaway, which is more than it can be. In the few samples of a reversal it hardly
+    changes, and has one sign as a rule: its variance is TURNING_BACK times the square of its largest value there.
+    breaking (width + 1, D): `RoughForces.breaking` along the window. still (width + 1, D): whether the axis rests, or
+    turns back. phi (width + 1,): weights of the integral.
     """
-    inside = effective_samples(phi) * (phi[:, None] * breaking * still) ** 2
+    alike = np.minimum(TURNING_BACK * _lengths(still), effective_samples(phi))
+    inside = alike * (phi[:, None] * breaking * still) ** 2
     half_hops = np.arange(0, phi.size - 1, (phi.size - 1) // INSTANTS)
     return np.asarray(np.sqrt(np.add.reduceat(inside[:-1], half_hops)))
+
+
+def _lengths(still: Mask) -> Array:
+    """Length (K, D), in samples, of the stop that each sample belongs to, 0 of one in which the axis moves."""
+    number = np.arange(len(still))[:, None]
+    before = np.maximum.accumulate(np.where(still, -1, number), axis=0)
+    behind = np.minimum.accumulate(np.where(still, len(still), number)[::-1], axis=0)[::-1]
+    return np.asarray(np.where(still, behind - before - 1, 0), dtype=np.float64)
 
 
 @cache

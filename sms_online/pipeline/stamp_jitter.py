@@ -140,11 +140,12 @@ def _square(now: JitterState, some: Sequence[int], others: Sequence[int]) -> tup
 def noise_beside(left: Array, rates: Array, jitter: float) -> float:
     """1σ of a channel's noise (B,) beside a jitter, s, of its stamps at rates (B,)."""
     of_jitter = (jitter * rates) ** 2
-    variance = float(np.mean(left**2))
+    least = np.finfo(np.float64).tiny
+    variance = max(float(np.mean(left**2)), least)
     for _ in range(PASSES):
         expected = variance + of_jitter
         weight = (expected.min() / expected) ** 2
-        variance = max(float(np.sum(weight * (left**2 - of_jitter)) / np.sum(weight)), np.finfo(np.float64).tiny)
+        variance = max(float(np.sum(weight * (left**2 - of_jitter)) / np.sum(weight)), least)
     return float(np.sqrt(variance))
 
 

@@ -1,4 +1,8 @@
-"""Where an axis is at rest: there stiction takes any value up to breakaway, and no law says which."""
+"""Where an axis is at rest or turns back: there dry friction takes any value up to breakaway, and no law says which.
+
+Laws are evaluated with a filtered rate. It does not change its sign when the axis does, for friction makes the rate's
+slope jump there: the impulse that a law is then off by goes with that jump, as a rotor's inertia does.
+"""
 
 from __future__ import annotations
 
@@ -33,14 +37,24 @@ def lasting(slow: Mask, sample_rate: float) -> Mask:
     return still
 
 
+def turns(rates: Array) -> Mask:
+    """Samples (K, D) on either side of a change of the sign of rates (K, D)."""
+    changes = np.signbit(rates[1:]) != np.signbit(rates[:-1])
+    out = np.zeros(rates.shape, dtype=np.bool_)
+    out[1:] |= changes
+    out[:-1] |= changes
+    return out
+
+
 class StandstillState(State):
     """What is kept of a motion.
 
-    angles (B, D): from number `first` on. still (·, D): from a filter's half width of samples after that on.
+    angles (B, D): from number `first` on. still, turning (·, D): from a filter's half width of samples after that on.
     """
 
     angles: Array
     still: Mask
+    turning: Mask
     first: int = 0
 
 
@@ -52,7 +66,8 @@ class Standstill(Stage):
 
     def __init__(self, motors: int, sample_rate: float) -> None:
         self._rate, self._half_width = sample_rate, rate_filter(sample_rate)
-        self.state = StandstillState(np.empty((0, motors)), np.empty((0, motors), dtype=bool))
+        none = np.empty((0, motors), dtype=bool)
+        self.state = StandstillState(np.empty((0, motors)), none, none)
 
     def push(self, angles: Array, noise: Array) -> None:
         """Take the next angles (B, D); noise (D,): of each, 1σ per sample."""
@@ -63,13 +78,20 @@ class Standstill(Stage):
         rates = smooth_all(self.state.angles, M, self._rate)[1]
         limits = [slowest(sigma, M, self._rate) for sigma in noise.tolist()]
         self.state.still = np.stack([lasting(slow, self._rate) for slow in (np.abs(rates) < limits).T], axis=1)
+        self.state.turning = turns(rates)
 
     def at(self, samples: Indices) -> Mask:
         """Whether the axes are at rest at samples (K,), (K, D); what is not known yet is as what is known last."""
-        now = self.state
-        if not len(now.still):
-            return np.zeros((samples.size, now.still.shape[1]), dtype=bool)
-        return np.asarray(now.still[np.clip(samples - now.first - self._half_width, 0, len(now.still) - 1)])
+        return self._seen(self.state.still, samples)
+
+    def turning(self, samples: Indices) -> Mask:
+        """Whether they turn back there (K, D), likewise."""
+        return self._seen(self.state.turning, samples)
+
+    def _seen(self, mask: Mask, samples: Indices) -> Mask:
+        if not len(mask):
+            return np.zeros((samples.size, mask.shape[1]), dtype=bool)
+        return np.asarray(mask[np.clip(samples - self.state.first - self._half_width, 0, len(mask) - 1)])
 
     def drop(self, before: int) -> None:
         """Forget what no request for samples from number `before` on needs."""
@@ -77,8 +99,5 @@ class Standstill(Stage):
         # The newest rates are as far behind as the filter reaches, and what they have lasted follows from them.
         reach = 2 * self._half_width + round(LASTING * self._rate) + 1
         drop = max(0, before - reach - now.first)
-        now.angles, now.still, now.first = (
-            now.angles[drop:],
-            now.still[drop:],
-            now.first + drop,
-        )
+        now.angles, now.first = now.angles[drop:], now.first + drop
+        now.still, now.turning = now.still[drop:], now.turning[drop:]
