@@ -21,8 +21,12 @@ LEAST_RUN = 8
 # than this many of its smallest steps has stopped all at once.
 SUDDEN = 3.0
 # Friction stops a fine encoder from several steps, too, but not from a change of more than this multiple of what its
-# changes usually differ by from one to the next, rms.
-USUAL_STOP = 5.0
+# changes usually differ by from one to the next: their median, rounded up to a power of two.
+USUAL_STOP = 4.0
+# So it is for readings whose changes differ by so many of their smallest steps at most.
+NOISELESS = 8.0
+# Exponents of two that such differences are counted by.
+EXPONENTS = (-60, 20)
 # Turns at which readings wrap, in rad and degrees: a step within this share of one, where others are far smaller.
 TURNS, TURN_TOLERANCE = (2.0 * np.pi, np.pi, 360.0), 0.1
 # A reading that wraps elsewhere steps by more than this multiple of its usual steps, every time by the same within
@@ -102,7 +106,8 @@ class StuckGuard:
         self._quantum = np.full(channels, np.inf)  # size of the smallest change
         self._seen = np.zeros(channels, dtype=np.int64)
         self._repeated = np.zeros(channels, dtype=np.int64)
-        self._bends = np.zeros(channels)  # sum of squares of what changes differ by from one to the next
+        # How often changes differed by so much from one to the next.
+        self._bends = np.zeros((channels, EXPONENTS[1] - EXPONENTS[0] + 1), dtype=np.int64)
 
     def blank(self, values: Array, new: int) -> None:
         """Blank, in place, what is stuck in rows (K, C), of which the last `new` are seen for the first time."""
@@ -117,7 +122,8 @@ class StuckGuard:
             if whole and changes.all():
                 # Everything moved all the time, NaN before the first sample included.
                 self._quantum[group] = np.fmin(self._quantum[group], np.fmin.reduce(changes, axis=0))
-                self._bends[group] += _bends(changes, self._change[group])
+                for channel, own in zip(group.tolist(), changes.T, strict=True):
+                    self._count_bends(channel, own)
                 self._last[group], self._run[group] = values[rows[-1], group], 0
                 self._change[group] = changes[-1]
                 self._seen[group] += rows.size
@@ -140,8 +146,7 @@ class StuckGuard:
         size = np.where(changed >= 0, change[changed], self._change[channel])
         limit = self._limit(channel)
         stuck = (run >= limit) & (size > self._sudden(channel))
-        if not stuck.any():
-            self._bends[channel] += _bends(change, self._change[channel])
+        self._count_bends(channel, change)
         self._last[channel], self._run[channel] = samples[-1], run[-1]
         self._change[channel] = size[-1]
         # What is stuck teaches nothing about the sensor's ways.
@@ -158,8 +163,19 @@ class StuckGuard:
 
     def _sudden(self, channel: int) -> float:
         """The largest change from which the sensor may come to rest all at once."""
-        usual = np.sqrt(self._bends[channel] / max(1, self._seen[channel])) if self._repeated[channel] else 0.0
-        return float(max(SUDDEN * self._quantum[channel], USUAL_STOP * usual))
+        least = SUDDEN * float(self._quantum[channel])
+        counts = np.cumsum(self._bends[channel])
+        if not self._repeated[channel] or not counts[-1]:
+            return least
+        usual = 2.0 ** (int(np.searchsorted(counts, 0.5 * counts[-1])) + EXPONENTS[0])
+        # Noise of more steps moves a sensor at rest, too.
+        return max(least, USUAL_STOP * usual) if usual <= NOISELESS * self._quantum[channel] else least
+
+    def _count_bends(self, channel: int, change: Array) -> None:
+        """Count what changes (B,) differ by from one to the next, the first from the last one so far; none at rest."""
+        bends = np.abs(np.diff(change, prepend=self._change[channel]))
+        exponents = np.frexp(bends[bends > 0.0])[1]
+        np.add.at(self._bends[channel], np.clip(exponents, *EXPONENTS) - EXPONENTS[0], 1)
 
     def _limit(self, channel: int) -> int:
         """Repetitions in a row that are an alarm."""
@@ -167,8 +183,3 @@ class StuckGuard:
             return int(np.iinfo(np.int64).max)
         share = (self._repeated[channel] + 1.0) / (self._seen[channel] + 2.0)
         return max(LEAST_RUN, int(np.ceil(np.log(FALSE_ALARM) / np.log(share))))
-
-
-def _bends(changes: Array, before: Array | float) -> Array:
-    """Sum of squares of what changes (B, ...) differ by from one to the next, the first from that before."""
-    return np.asarray(np.nansum(np.diff(changes, axis=0, prepend=np.asarray(before)[None]) ** 2, axis=0))
