@@ -274,8 +274,10 @@ class Evaluation:
         scale = np.divide(std[known], stated, out=np.ones_like(stated), where=stated > 0.0)
         covariance = np.diag(np.full(std.size, np.inf))
         covariance[np.ix_(known, known)] = estimate.covariance[np.ix_(known, known)] * np.outer(scale, scale)
+        # Where none is described, its parameters are those of a jump.
+        changes = ["payload"] if self.statistics.setup.system.payload is None else []
         try:
-            return PhysicalSet(self.model, self.base).project(estimate.pi, covariance)
+            return PhysicalSet(self.model, self.base, changes).project(estimate.pi, covariance)
         except ArithmeticError:
             return None
 

@@ -12,6 +12,7 @@ Robotics and Automation Letters 3 (2018) 60. Base parameters β are consistent w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +66,9 @@ class PhysicalSet:
     coefficients of effects, which may have either sign, are not bounded.
     """
 
-    def __init__(self, model: Model, base: BaseParameters) -> None:
+    def __init__(self, model: Model, base: BaseParameters, changes: Sequence[str] = ()) -> None:
+        """changes: owners of parameters that are what a body has changed by, not bounded either: one that is released
+        takes as much away as one that is grasped adds."""
         known = dict(base.known)
         effects = {k for columns in model.effect_slices for k in range(columns.start, columns.stop)}
         bodies, others = _bodies(model)
@@ -78,7 +81,7 @@ class PhysicalSet:
         self._leads = [k in base.independent for k in signed]
         self._F, self._F_0 = np.zeros((0, 4, 4, len(unknown))), np.zeros((0, 4, 4))
         self._start = np.ones(len(unknown))
-        for owner, block in bodies.items():
+        for owner, block in ((owner, block) for owner, block in bodies.items() if owner not in changes):
             free, constant = block[..., unknown], block @ values
             unused = ~block.any(axis=(1, 2))
             constant[unused, unused] = 1.0

@@ -10,10 +10,11 @@ import scipy.optimize
 from numpy.testing import assert_allclose
 
 from sms_online.description.parse import parse_system, shipped_text
-from sms_online.effects.build import build_model
+from sms_online.effects.build import build_model, changed_model
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.physical import PhysicalSet
+from sms_online.pipeline.event_hypotheses import everything, extended
 from sms_online.stream import Array
 
 PENDULUM = """
@@ -253,3 +254,16 @@ def test_coefficients_of_effects_may_have_either_sign() -> None:
     assert effects
     beta[effects] *= -1.0
     assert physical.project(beta, np.diag((1e-3 * np.abs(beta) + 1e-9) ** 2)).beta is beta
+
+
+def test_a_payload_that_is_released_takes_mass_away() -> None:
+    """As a change of the last link's body; as a body of its own it would have negative mass."""
+    system = parse_system(PENDULUM, "pendulum")
+    model = build_model(system)
+    whole = changed_model(model, everything(system))
+    base = extended(find_base_parameters(model), whole, ["payload.mass"])
+    # I_zz + m x², m x and m y of the link, and the payload's mass.
+    beta, std = np.array([0.6, 1.0, 0.0, -0.4]), np.full(4, 1e-3)
+    assert names(base)[-1] == "payload.mass"
+    assert PhysicalSet(whole, base).project(beta, np.diag(std**2)).distance > 10.0
+    assert PhysicalSet(whole, base, ["payload"]).project(beta, np.diag(std**2)).distance == 0.0
