@@ -11,7 +11,6 @@ import pytest
 
 import sms_online as sms
 from sms_online.diagnosis.drifts import may_explain
-from sms_online.errors import InputError
 from sms_online.verdict.reasons import FOLLOW
 from sms_tools.cli import main
 from tests.axis import AXIS, DAMPING, INERTIA, axis_block
@@ -140,10 +139,13 @@ def test_what_no_drift_explains_needs_no_session(drifts: float, lacks: float, ma
 
 
 @pytest.mark.slow
-def test_a_step_stays_an_event() -> None:
+def test_a_step_is_a_jump_and_no_drift() -> None:
     t = np.arange(3200) / 200.0
-    with pytest.raises(InputError, match="an event"):
-        sms.diagnose(system(), capture(np.where(t < 8.0, 0.0, 0.2)))
+    found = sms.diagnose(system(), capture(np.where(t < 8.0, 0.0, 0.2))).document()
+    assert found["drifts"] == []
+    (change,) = found["changes"]
+    assert change["time"] == pytest.approx(8.0, abs=0.2)
+    assert found["judgement"]["level"] == "doubt"
 
 
 @pytest.mark.slow
