@@ -129,6 +129,7 @@ def _units(system: System, positions: Sequence[str]) -> Iterator[MistakeHypothes
     angles, lengths = ([name for name in positions if channel_unit(system, name) == unit] for unit in ("rad", "m"))
     for name, text, factor, all_of, words in (
         ("degrees", "is in degrees in place of rad", DEGREE, angles, "all angles"),
+        ("milliradians", "is in mrad in place of rad", 1e-3, angles, "all angles"),
         ("millimetres", "is in mm in place of m", 1e-3, lengths, "all lengths"),
     ):
         for where, names in {**{n: [n] for n in all_of}, **_groups(all_of)}.items():
