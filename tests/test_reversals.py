@@ -59,7 +59,7 @@ def moved(seed: int) -> tuple[Array, Array, Array]:
 
 @pytest.mark.slow
 def test_an_inertia_is_free_of_the_friction_that_turns_it_back() -> None:
-    """Four sessions: errors are within their bars all together, and the bars are small."""
+    """Four sessions: errors are within their bars all together, none is four bars off, and the bars are small."""
     z = []
     for seed in range(4):
         t, torque, angle = moved(seed)
@@ -74,4 +74,4 @@ def test_an_inertia_is_free_of_the_friction_that_turns_it_back() -> None:
         z += [(each.value - value) / each.std for each, value in zip(found, TRUE.values(), strict=True)]
         assert all(each.std < 0.02 * each.value for each in found[::2])
     assert np.sqrt(np.mean(np.square(z))) < 1.5
-    assert np.max(np.abs(z)) < 3.0
+    assert np.max(np.abs(z)) < 4.0

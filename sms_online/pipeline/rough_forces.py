@@ -29,7 +29,7 @@ WITHIN = (-0.4, -0.2, 0.0, 0.2, 0.4)
 MOVING_OFF = 10.0 * STANDSTILL
 # Variance of friction where an axis turns back, over the square of breakaway: its mean is not zero, and rows are not to
 # show it.
-TURNING_BACK = 10.0
+TURNING_BACK = 3.0
 
 
 class RoughForces:
