@@ -165,7 +165,9 @@ def _lengths(still: Mask) -> Array:
     number = np.arange(len(still))[:, None]
     before = np.maximum.accumulate(np.where(still, -1, number), axis=0)
     behind = np.minimum.accumulate(np.where(still, len(still), number)[::-1], axis=0)[::-1]
-    return np.asarray(np.where(still, behind - before - 1, 0), dtype=np.float64)
+    # One that reaches beyond a window's end is long.
+    cut = (before < 0) | (behind == len(still))
+    return np.asarray(np.where(still, np.where(cut, len(still), behind - before - 1), 0), dtype=np.float64)
 
 
 @cache
