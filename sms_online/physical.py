@@ -81,7 +81,9 @@ class PhysicalSet:
         self._leads = [k in base.independent for k in signed]
         self._F, self._F_0 = np.zeros((0, 4, 4, len(unknown))), np.zeros((0, 4, 4))
         self._start = np.ones(len(unknown))
-        for owner, block in ((owner, block) for owner, block in bodies.items() if owner not in changes):
+        for owner, block in bodies.items():
+            if owner in changes:
+                continue
             free, constant = block[..., unknown], block @ values
             unused = ~block.any(axis=(1, 2))
             constant[unused, unused] = 1.0

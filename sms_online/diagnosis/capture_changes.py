@@ -22,6 +22,7 @@ from sms_online.pipeline.event_hypotheses import PAYLOAD, hypotheses, kind_of
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum_windows import HOPS
 from sms_online.stream import Array, Block
+from sms_online.verdict.reasons import place_of
 
 # Times that are tried in a capture.
 TIMES = 100
@@ -33,7 +34,6 @@ LEFT = 0.05
 EXPLAINED = 0.9
 # The part before it is what a system file describes, and is diagnosed if it is at least this share of that behind it.
 LEAST_BEFORE = 0.5
-
 
 # What jumps, and its columns (W, n_v, ·), whitened.
 _Jump = tuple[tuple[Parameter, ...], Array]
@@ -52,8 +52,7 @@ class CaptureChange:
     @property
     def places(self) -> tuple[str, ...]:
         """Where on the arm it sits."""
-        owners = (name.rpartition(".")[0] for name in self.event.parameters)
-        return tuple(dict.fromkeys(owner.partition("@")[2] or owner for owner in owners))
+        return tuple(dict.fromkeys(chain.from_iterable(map(place_of, self.event.parameters))))
 
     @property
     def sentence(self) -> str:
