@@ -108,6 +108,19 @@ def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: st
     np.testing.assert_allclose(corrected.samples(block.channels, block.values), session(4).values, rtol=1e-9)
 
 
+@pytest.mark.parametrize(("factor", "keys"), [(1e3, ["torque_unit@tau_1, tau_2"]), (1.0, [])])
+def test_the_unit_of_torques_shows_beside_friction(factor: float, keys: list[str]) -> None:
+    """Undescribed friction of five times the torques: it explains most of them in any unit."""
+
+    def change(values: dict[str, Array]) -> None:
+        for i in (1, 2):
+            torque, angle = values[f"tau_{i}"], values[f"theta_m_{i}"]
+            friction = 5.0 * np.sqrt(np.mean(torque**2)) * np.sign(np.gradient(angle))
+            values[f"tau_{i}"] = factor * (torque + friction)
+
+    assert [mistake.key for mistake in found(change).mistakes] == keys
+
+
 @pytest.mark.slow
 def test_a_wrong_gear_is_corrected_in_the_system() -> None:
     """The rotor's inertia acts with the square of the ratio and with the ratio itself: no factor of the torque does."""

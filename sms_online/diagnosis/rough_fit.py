@@ -46,7 +46,7 @@ class RoughFit:
     """What least squares leaves of samples.
 
     beta (n,): parameters. left (rows,): rms share of each coordinate's rows that is not explained. nominal (rows,): the
-    same with nominal values in place of those fitted.
+    same with nominal values in place of those fitted, of what friction does not explain.
     """
 
     beta: Array
@@ -223,8 +223,15 @@ class RoughRows:
         return float(np.exp(np.mean(np.log(known)))) if known.size else 1.0
 
     def _by_nominal(self, b: Array, size: Array) -> Array:
-        """What nominal values, friction and offsets leave of rows b (W, n_v), over their size (n_v,), of those used."""
-        return _left(self._friction, b - self._Y @ self._nominal, size)[1][self._used]
+        """What nominal values, friction and offsets leave of rows b (W, n_v), as shares (rows,) of those used.
+
+        Of rows with a torque a share of what friction and offsets alone leave: they explain a torque in any unit, as
+        far as it is friction. Of others a share of their size (n_v,).
+        """
+        nominal = _left(self._friction, b - self._Y @ self._nominal, size)[1]
+        alone = _left(self._friction, b, size)[1]
+        whole = np.where(self._homogeneous, 1.0, np.maximum(alone, SMALLEST))
+        return np.asarray((nominal / whole)[self._used])
 
 
 def _left(columns: Array, b: Array, size: Array) -> tuple[Array, Array]:
