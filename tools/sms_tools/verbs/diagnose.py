@@ -103,7 +103,7 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     # What is to be seen has been found already: no diagnosis runs beside it.
     # Estimated anew: what was fitted to these samples is nothing known of them beforehand.
     after = found.search.after.system
-    estimator = Estimator(after, capture.channels, str(args.captures[0]))
+    estimator = Estimator(after, capture.channels, str(args.captures[0]), whole=True)
     estimates: dict[str, tuple[float, float]] = {}
     if (known := found.search.attempt.case.prior(estimator)) is not None:
         estimator.set_prior(known)
