@@ -18,6 +18,7 @@ from sms_online.effects.channel import EncoderEccentricity
 from sms_online.effects.delay import ActuatorDelay, SensorLag, TorqueDelay
 from sms_online.errors import InputError
 from sms_online.pipeline.conditioning import Conditioning
+from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Array
 from sms_sim.plant import Plant
@@ -203,6 +204,23 @@ coefficients = { corner = 25.0 }
     assert not lag.acts_on("link_2.marker_2.u_y")
     with pytest.raises(InputError, match="a channel or a pattern of channels"):
         parse_system(text.replace("link_1.marker_*", "link_3.*"), "file")
+
+
+def test_a_file_declares_one_delay_of_all_drives() -> None:
+    """What a diagnosis that finds it writes."""
+    text = (
+        shipped_text("paper-planar")
+        + """
+[[effect]]
+name = "torque_delay"
+where = "joint_*"
+coefficients = { time = 0.01 }
+"""
+    )
+    assert [effect.where for effect in parse_system(text, "file").effects] == ["joint_*"]
+    assert channel_effects(parse_system(text, "file"))
+    with pytest.raises(InputError, match="expected one of joint_1, joint_2"):
+        Estimator(parse_system(text.replace("torque_delay", "coulomb_friction"), "file"), ("tau_1",), "test")
 
 
 def test_undeclared_effects_leave_no_stage_in_the_way() -> None:

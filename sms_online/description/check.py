@@ -247,7 +247,7 @@ def _check_effects(system: System, names: tuple[str, ...], source: str) -> None:
     places = ("base", *_numbered(system), "tip")
     seen: set[str] = set()
     for k, effect in enumerate(system.effects, start=1):
-        if effect.where not in places and not any(fnmatchcase(name, effect.where) for name in names):
+        if not any(fnmatchcase(name, effect.where) for name in (*places, *names)):
             near = nearest(effect.where, (*places, *names))
             raise InputError(
                 source,
