@@ -11,6 +11,7 @@ from scipy.interpolate import make_interp_spline
 from sms_adapters.system_file import load_system
 from sms_online.calibration.found import Calibration
 from sms_online.calibration.nuisance import Nuisance, known_beforehand, prior_rows
+from sms_online.calibration.release import released
 from sms_online.description.parse import parse_system, shipped_text
 from sms_online.description.schema import Tolerances
 from sms_online.errors import InputError
@@ -45,6 +46,25 @@ def test_the_prior_solution_marginalises_the_nuisance() -> None:
     np.testing.assert_allclose(estimate.covariance, covariance, rtol=1e-10)
     np.testing.assert_allclose(estimate.pi, covariance @ (Y.T @ weight @ b[:, 0]), rtol=1e-10)
     assert estimate.nuisances.shape == estimate.nuisances_std.shape == (1,)
+
+
+@pytest.mark.parametrize(("off", "given"), [(0.4, 0.0), (40.0, 0.4)])
+def test_rows_release_a_tolerance_that_keeps_a_value_within_it(off: float, given: float) -> None:
+    """Rows know the nuisance to 3 tolerances at best: one of 40 is estimated within 2 of them."""
+    random, clock = np.random.default_rng(1), Nuisance("clock", "a", "s", 0.01)
+    rows = random.standard_normal((1100, 2))
+    b = rows @ [off * clock.tolerance, 1.0] + random.standard_normal(1100)
+    tracker = session_tracker(1, None, 1)
+    tracker.begin(known_beforehand((clock,), 1))
+    tracker.update(Rows(rows, b, np.ones(1100), np.arange(1100.0)))
+    estimate = tracker.estimate()
+    late = released(estimate, (clock,), estimate.covariance)
+    if not given:
+        np.testing.assert_array_equal(late.pi, estimate.pi)
+        return
+    assert late.pi[0] == pytest.approx(given, abs=0.1)
+    assert late.std[0] == pytest.approx(0.03, rel=0.2)
+    assert estimate.std[0] < 0.01
 
 
 def test_nothing_is_known_of_a_nuisance_without_a_tolerance() -> None:

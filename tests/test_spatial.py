@@ -96,11 +96,6 @@ def test_seven_joints_raise_no_alarm(seed: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="the seven-joint arm is not honest yet: some determined parameters are tens of their error bars off",
-)
 def test_seven_joint_arm_at_250_hz_and_grade_b() -> None:
     """A first fit without weights cannot separate 91 parameters; values twice the true ones start it well enough."""
     system = load_system("seven-joint").model_copy(update={"sample_rate": 250.0})

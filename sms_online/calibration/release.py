@@ -19,6 +19,8 @@ from sms_online.trackers.interface import Estimate
 
 # Within this many tolerances, which chance may explain, a tolerance counts as stated.
 NORMAL = 2.0
+# Deviations of what rows make of a tolerance that chance does not explain, and what rounding makes of one.
+UNLIKELY, ROUNDING = 3.0, 1e-6
 # Weights and estimate follow each other; so many times at most, until no weight changes by more than this.
 PASSES, SAME = 20, 1e-6
 # A tolerance counts at least this share of its information: what else determines a nuisance must do so by itself.
@@ -52,12 +54,16 @@ def released(estimate: Estimate, nuisances: Sequence[Nuisance], squares: Array) 
     tolerance = np.array([each.tolerance for each in nuisances])
     may = np.array([np.isfinite(each.tolerance) and each.may_give_way for each in nuisances], dtype=np.bool_)
     known = np.flatnonzero(may & estimate.determined[:m])
-    if not np.any(np.abs(estimate.pi[known]) > NORMAL * tolerance[known]):
+    if not known.size:
         return estimate
     # Beside a prior all rows were weighted with one factor, these among them.
     unit = tolerance[known] * (1.0 if estimate.scale is None else estimate.scale)
     C, start = squares[:, known] / unit, estimate.pi[known] / unit
     block = at_most_tolerances(C[known] / unit[:, None])
+    # A tolerance far below what the rows know may keep a value within it that they contradict.
+    expected = np.sqrt(np.maximum(0.0, 1.0 - np.diag(block)))
+    if not np.any(np.abs(start) > np.minimum(NORMAL, UNLIKELY * expected + ROUNDING)):
+        return estimate
     names = np.array([nuisances[k].name for k in known.tolist()])
     # What is wrong in one kind alone may look like a little of many: such are the minima to begin from.
     begun = [start, *(_value(start, block, np.where(names == name, LEAST, 1.0))[0] for name in dict.fromkeys(names))]

@@ -24,6 +24,16 @@ def described(model: Model, base: BaseParameters) -> tuple[Array, Array]:
     return base.values(pi), size
 
 
+def near_rows(value: Array, size: Array, nuisances: int) -> Array:
+    """Described values (n,) as normal priors: rows [N Y b] (k, m + n + 1) of unit variance; see `nearer`."""
+    known = np.flatnonzero(size > 0.0)
+    rows = np.zeros((known.size, nuisances + value.size + 1))
+    unit = LOOSE * size[known]
+    rows[np.arange(known.size), nuisances + known] = 1.0 / unit
+    rows[:, -1] = value[known] / unit
+    return rows
+
+
 def nearer(estimate: Estimate, value: Array, size: Array) -> Array:
     """Nuisances and π (m + n,) of an estimate, with described values (n,) as normal priors of π.
 

@@ -19,7 +19,7 @@ import numpy as np
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.criterion import Columns
-from sms_online.pipeline.description import described
+from sms_online.pipeline.description import described, near_rows
 from sms_online.pipeline.drift_line import DriftLine
 from sms_online.pipeline.first_weights import FirstWeights
 from sms_online.pipeline.latency import SourceGroup
@@ -134,9 +134,9 @@ class MomentumFit(Stage):
         )
         self._gained = gained(model)
         self.torque = np.isin(np.arange(model.layout.n_v), model.layout.theta_m)
-        nominal = base.values(model.nominal)
+        self._near = near_rows(*self.described, self._nuisances)
         self._first_weights = FirstWeights(
-            nominal, self._calibration, self.columns, self.torque, self._gained, self._prior_information
+            self.described[0], self._calibration, self.columns, self.torque, self._gained, self._prior_information
         )
         self._new_noise, self._sources = new_noise, sources
         self.whitening = self._new_whitening()
@@ -264,10 +264,13 @@ class MomentumFit(Stage):
     def _calibrated(self, joint: Array) -> Array:
         """Nuisances and β (m + n,) that leave no more than noise, where tolerances allow that; or the same.
 
+        Near described values: noise that follows a parameter which rows do not determine would be all that they leave.
+
         Rows that were whitened as if the model lacked something determine large nuisances too roughly to show it.
         """
         m, squares = self._nuisances, np.einsum("vii->vi", self.plain.gram)[:, self._nuisances : -1]
-        found = fitted(self.plain.gram.sum(axis=0), self._prior_information(), m, joint)
+        known = self._prior_information().beside(self._near)
+        found = fitted(self.plain.gram.sum(axis=0), known, m, joint)
         # Rows without a torque leave less where π shrinks.
         shrunk = np.any(squares @ found[m:] ** 2 < SHRUNK**2 * (squares @ joint[m:] ** 2))
         if not shrunk and not self.plain.excess(found).any():

@@ -14,7 +14,7 @@ Statistics 26 (2012) 372.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,10 @@ class PriorInformation:
     def none(n: int) -> PriorInformation:
         """Nothing is known of n parameters."""
         return PriorInformation(np.zeros((0, n + 1)), np.zeros((0, n + 1)))
+
+    def beside(self, rows: Array) -> PriorInformation:
+        """The same with more that is certain, rows (k, m + n + 1)."""
+        return replace(self, certain=np.concatenate((self.certain, rows)))
 
 
 class Penalty:
