@@ -153,6 +153,11 @@ class Session:
         if block.t.size:
             self._last = float(block.t[-1])
 
+    def pause(self) -> None:
+        """Expect a pause: no sample until the next one, after a second or more, counts as lost."""
+        self.estimator.renew()
+        self._result = None
+
     def finish(self) -> None:
         """End the session: process the samples that wait for later ones. The result is then final."""
         if self.estimator.finished:

@@ -131,3 +131,16 @@ def test_a_source_that_falls_silent_at_once_is_named(tmp_path: Path, system: Sys
         assert trust.sentence == "Not yet: encoder: silent"
         assert trust.reasons[1:3] == ("drive: silent", "no parameter is determined by the motion of 0.245 s")
         assert "the device" in trust.next_step
+
+
+@pytest.mark.parametrize(("pause", "lost"), [(True, 0), (False, 999)])
+def test_a_pause_between_two_recordings_is_no_loss(pause: bool, lost: int) -> None:
+    block = axis_block(coulomb=0.0)
+    session = sms.Session(parse_system(AXIS, "axis.toml"), block.channels)
+    session.update(block)
+    if pause:
+        session.pause()
+    session.update(sms.Block(block.t + block.t[-1] + 5.0, block.channels, block.values))
+    session.finish()
+    assert session.result.lost_samples == lost
+    assert ("samples are lost" in session.result.trust.sentence) is not pause
