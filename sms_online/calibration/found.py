@@ -121,11 +121,14 @@ def _rounded(value: float, std: float) -> str:
 
 
 def found(nuisances: Sequence[Nuisance], values: Array, deviations: Array) -> list[Calibration]:
-    """What is estimated better than its tolerance; values, deviations (m,): of all."""
+    """What is estimated better than its tolerance, and each gain; values, deviations (m,): of all.
+
+    The parameters of a joint go with the gain of its torque, and predict that torque with it alone.
+    """
     out = []
     for nuisance, value, std in zip(nuisances, values.tolist(), deviations.tolist(), strict=True):
         known = np.isfinite(nuisance.tolerance)
-        better = known and std < IMPROVED * nuisance.tolerance
+        better = known and (std < IMPROVED * nuisance.tolerance or (nuisance.name == "drive_gain" and std > 0.0))
         if better or ((not known or abs(value) > BEYOND * nuisance.tolerance) and std < OF_ITS_SIZE * abs(value)):
             tolerance = nuisance.tolerance if known else None
             out.append(Calibration(nuisance.name, nuisance.where, nuisance.part, nuisance.unit, value, std, tolerance))
