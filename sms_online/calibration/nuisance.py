@@ -34,9 +34,10 @@ class Nuisance:
     def may_give_way(self) -> bool:
         """Whether samples that clearly contradict its tolerance release it; else it counts as stated.
 
-        A gain sets the scale of what a torque explains: it could make the torque zero.
+        A gain sets the scale of what a torque explains: it could make the torque zero. A share of what more elements
+        change is none far beyond one, whatever else looks like it.
         """
-        return self.name not in ("drive_gain", "drive_offset")
+        return self.name not in ("drive_gain", "drive_offset", "truncation")
 
 
 def known_beforehand(nuisances: Sequence[Nuisance], n: int) -> Information:
