@@ -24,7 +24,7 @@ from sms_online.diagnosis.improvement import (
     with_constants,
 )
 from sms_online.diagnosis.late_sensors import LateSensor, find_late
-from sms_online.diagnosis.mistakes import Mistake, find_mistakes, wrong_clock
+from sms_online.diagnosis.mistakes import MOST_WORSE, Mistake, find_mistakes, wrong_clock
 from sms_online.diagnosis.record import SampleRecord, Segment
 from sms_online.diagnosis.search import Search
 from sms_online.diagnosis.torque_zeros import HELD_OUT, TorqueZero, torque_zeros, without_zeros
@@ -76,10 +76,15 @@ def diagnose(
     mistakes = (*([] if clock is None else [clock]), *corrected.mistakes)
     if corrected.mistakes:
         progress("; ".join(mistake.sentence for mistake in corrected.mistakes), FITTED_ONCE)
-        system = corrected.system
-        runs, holdout = [undone(run, corrected) for run in runs], undone(holdout, corrected)
-        before, record = _session(system, runs, source, prior)
-        _noise(before, source)
+        again: list[Sequence[Block]] = [undone(run, corrected) for run in runs]
+        session, samples = _session(corrected.system, again, source, prior)
+        if _fits_worse(session, before):
+            # A rough fit allows for parameters that rows with weights do not.
+            mistakes = mistakes[: len(mistakes) - len(corrected.mistakes)]
+        else:
+            system, runs, holdout = corrected.system, again, undone(holdout, corrected)
+            before, record = session, samples
+            _noise(before, source)
     held = _held(system, holdout, source, prior)
     case = Case(
         source, before, _noise(before, source), record.segments(), held, prior, progress, stop, learned,
@@ -207,6 +212,15 @@ def diagnose(
         estimator_after=estimator_after,
         unexplained=unexplained,
     )
+
+
+def _fits_worse(session: Estimator, before: Estimator) -> bool:
+    """Whether a session leaves clearly more of its noise than the one before."""
+    now, then = (
+        max((each.whitened or 0.0 for each in evaluated(one).residuals.values()), default=0.0)
+        for one in (session, before)
+    )
+    return then > 0.0 and now > MOST_WORSE * max(then, 1.0)
 
 
 def _jump(session: Estimator, attempt: Attempt, chosen: Sequence[int], unexplained: bool) -> Event | None:
