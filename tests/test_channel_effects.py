@@ -188,16 +188,14 @@ def test_constants_of_a_channel_have_to_be_stated(text: str, words: str) -> None
         channel_effects(declaring(text))
 
 
+def planar_with(name: str, where: str, coefficients: str) -> str:
+    """The file of the planar example, with an effect declared."""
+    effect = f"name = '{name}'\nwhere = '{where}'\ncoefficients = {{ {coefficients} }}\n"
+    return f"{shipped_text('paper-planar')}\n[[effect]]\n{effect}"
+
+
 def test_a_file_declares_an_effect_on_a_group_of_channels() -> None:
-    text = (
-        shipped_text("paper-planar")
-        + """
-[[effect]]
-name = "sensor_lag"
-where = "link_1.marker_*"
-coefficients = { corner = 25.0 }
-"""
-    )
+    text = planar_with("sensor_lag", "link_1.marker_*", "corner = 25.0")
     (lag,) = channel_effects(parse_system(text, "file"))
     assert lag.coefficients == {"corner": 25.0}
     assert lag.acts_on("link_1.marker_2.u_y")
@@ -208,15 +206,7 @@ coefficients = { corner = 25.0 }
 
 def test_a_file_declares_one_delay_of_all_drives() -> None:
     """What a diagnosis that finds it writes."""
-    text = (
-        shipped_text("paper-planar")
-        + """
-[[effect]]
-name = "torque_delay"
-where = "joint_*"
-coefficients = { time = 0.01 }
-"""
-    )
+    text = planar_with("torque_delay", "joint_*", "time = 0.01")
     assert [effect.where for effect in parse_system(text, "file").effects] == ["joint_*"]
     assert channel_effects(parse_system(text, "file"))
     with pytest.raises(InputError, match="expected one of joint_1, joint_2"):

@@ -73,15 +73,14 @@ def diagnose(
     _noise(before, source)
     progress("looking for mistakes of units, signs and wiring", FITTED_ONCE)
     corrected = find_mistakes(before, record.segments())
-    mistakes = (*([] if clock is None else [clock]), *corrected.mistakes)
+    mistakes = () if clock is None else (clock,)
     if corrected.mistakes:
         progress("; ".join(mistake.sentence for mistake in corrected.mistakes), FITTED_ONCE)
         again: list[Sequence[Block]] = [undone(run, corrected) for run in runs]
         session, samples = _session(corrected.system, again, source, prior)
-        if _fits_worse(session, before):
-            # A rough fit allows for parameters that rows with weights do not.
-            mistakes = mistakes[: len(mistakes) - len(corrected.mistakes)]
-        else:
+        # A rough fit allows for parameters that rows with weights do not.
+        if not _fits_worse(session, before):
+            mistakes = (*mistakes, *corrected.mistakes)
             system, runs, holdout = corrected.system, again, undone(holdout, corrected)
             before, record = session, samples
             _noise(before, source)
