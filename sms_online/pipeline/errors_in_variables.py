@@ -10,12 +10,16 @@ efficient one as an alarm: Hausman, Econometrica 46 (1978) 1251.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from scipy.special import stdtrit
 
+from sms_online.calibration.nuisance import Nuisance
+from sms_online.calibration.release import released
 from sms_online.state import State
 from sms_online.stream import Array, Mask
 from sms_online.trackers.interface import Estimate
@@ -35,11 +39,13 @@ MOST_CLUSTERS = 128
 class NoiseBias(State):
     """Gathers normal equations with and without additional noise, in columns and right-hand sides.
 
-    gram (n + 1, n + 1): of rows [Y b]. whole: what additional noise changes, by clusters of `length` windows, in order
-    of time; last: of the cluster that windows still join, `joined` so far.
+    gram (n + 1, n + 1): of rows [Y b]. beforehand: its part that was known before any row. whole: what additional noise
+    changes, by clusters of `length` windows, in order of time; last: of the cluster that windows still join, `joined`
+    so far.
     """
 
     gram: Array
+    beforehand: Array
     last: Array
     whole: list[Array] = msgspec.field(default_factory=list)
     length: int = CLUSTER
@@ -49,7 +55,9 @@ class NoiseBias(State):
     def none(n: int, prior: Array | None = None) -> NoiseBias:
         """Bias of no rows; prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise."""
         gram, last = np.zeros((2, n + 1, n + 1))
-        return NoiseBias(gram if prior is None else prior.T @ prior, last)
+        if prior is not None:
+            gram = prior.T @ prior
+        return NoiseBias(gram, gram.copy(), last)
 
     def add(self, rows: Array, noisy: Array) -> None:
         """Rows [Y b] (M, n + 1) of a window, and the same with noise added and subtracted (2, M, n + 1)."""
@@ -74,8 +82,8 @@ class NoiseBias(State):
         """All of them (C, n + 1, n + 1), in order of time."""
         return np.array(self.whole if self.joined == 0 else [*self.whole, self.last]).reshape(-1, *self.gram.shape)
 
-    def correction(self, determined: Mask, lost_unknown: bool = False) -> tuple[Array, Array]:
-        """What to add to the least-squares estimate (n,) to free it of this bias, and to its covariance (n, n).
+    def correction(self, determined: Mask, lost_unknown: bool = False) -> Correction:
+        """What to add to the least-squares estimate to free it of this bias, and to its covariance.
 
         The synthetic noise is one sample, so the shift scatters. As much of it is given as is no scatter: a bias that
         many clusters agree on counts, one that few of them make shrinks to zero as James and Stein's estimate does.
@@ -86,17 +94,18 @@ class NoiseBias(State):
         score by the same function of a noise of the same law. Even orders of Gaussian noise do not correlate with odd
         ones, so the variances add: that of the second order to that of the first, and to both that of the shift.
         Where noise makes most of the information along a direction, the motion does not determine it: least squares
-        attenuate it by an unknown factor. There the shift is zero and its size a deviation; of the largest factor for
-        `lost_unknown`, so that anything else that is known prevails. Zero where nothing is determined.
+        attenuate it by an unknown factor. There rows count no more than what that shift would be, as a deviation,
+        allows; of the largest factor for `lost_unknown`. What was known before any row prevails. Zero where nothing is
+        determined.
         """
-        shift, covariance = np.zeros(determined.size), np.zeros((determined.size, determined.size))
+        shift, (lost_rows, uncertain) = np.zeros(determined.size), np.zeros((2, determined.size, determined.size))
         known = np.flatnonzero(determined)
         rows = np.append(known, determined.size)
         size = np.sqrt(np.diag(self.gram)[rows])
         if known.size == 0 or not (size > 0.0).all():
-            return shift, covariance
+            return Correction(shift, lost_rows, uncertain)
         scale = np.outer(size, size)
-        gram = self.gram[np.ix_(rows, rows)] / scale
+        gram, beforehand = self.gram[np.ix_(rows, rows)] / scale, self.beforehand[np.ix_(rows, rows)] / scale
         clusters = self._clusters[:, rows[:, None], rows] / scale
         # A column that is noise alone may make any multiple of its square: more than some would drown the others.
         own = np.abs(np.diag(clusters.sum(axis=0)))
@@ -105,7 +114,7 @@ class NoiseBias(State):
         changed = clusters.sum(axis=0)
         if not changed.any():
             # Directions of exact rows may be known so differently that rounding would move them.
-            return shift, covariance
+            return Correction(shift, lost_rows, uncertain)
         # Directions of unit information, and the share of it that noise makes.
         values, vectors = np.linalg.eigh(gram[:-1, :-1])
         root = vectors / np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
@@ -113,11 +122,12 @@ class NoiseBias(State):
         directions = root @ axes
         along = directions.T @ gram[:-1, -1]
         lost = share >= LARGEST_SHARE
-        kept = directions[:, ~lost]
-        whole = (kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost]
         apart = np.abs(1.0 - share[lost])
         factor = np.clip(share[lost] / np.maximum(apart, 1.0 / LARGEST_FACTOR), 1.0, LARGEST_FACTOR)
         attenuated = along[lost] * (LARGEST_FACTOR if lost_unknown else factor)
+        moved, widened = _beside_lost(directions, along, lost, attenuated * size[-1], beforehand)
+        kept = directions[:, ~lost]
+        whole = (kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost]
         # Each cluster's part of it, to first order.
         parts = kept.T @ (clusters[:, :-1] @ np.append(directions @ along, -1.0)).T
         count = parts.shape[1]
@@ -131,15 +141,15 @@ class NoiseBias(State):
 
         # Direction by direction: parameters that rows know together are shifted together.
         unit = size[-1] / size[:-1]
-        shift[known] = kept @ (certain(whole, parts) * whole) * unit
+        shift[known] = (kept @ (certain(whole, parts) * whole) + directions @ moved) * unit
         whole, parts = kept @ whole, kept @ parts
         share = certain(whole, parts)
-        spread = np.concatenate(
-            (parts, share[:, None] * parts, np.diag((1.0 - share) * whole), directions[:, lost] * attenuated), axis=1
-        )
+        spread = np.concatenate((parts, share[:, None] * parts, np.diag((1.0 - share) * whole)), axis=1)
         spread *= unit[:, None]
-        covariance[np.ix_(known, known)] = spread @ spread.T
-        return shift, covariance
+        uncertain[np.ix_(known, known)] = spread @ spread.T
+        among = directions / size[:-1, None]
+        lost_rows[np.ix_(known, known)] = among @ widened @ among.T
+        return Correction(shift, lost_rows, uncertain)
 
     @property
     def parameters(self) -> int:
@@ -153,13 +163,55 @@ class NoiseBias(State):
         def widened(gram: Array) -> Array:
             return np.insert(np.insert(gram, at, 0.0, 0), at, 0.0, 1)
 
-        self.gram, self.last = widened(self.gram), widened(self.last)
+        self.gram, self.beforehand, self.last = widened(self.gram), widened(self.beforehand), widened(self.last)
         self.whole = [widened(cluster) for cluster in self.whole]
 
 
-def unbiased(estimate: Estimate, bias: NoiseBias, lost_unknown: bool = False) -> Estimate:
-    """An estimate free of what noise in the columns does; one that was weighted against a prior stays as it is."""
-    if estimate.scale is not None:
-        return estimate
-    shift, covariance = bias.correction(estimate.determined, lost_unknown)
-    return replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + covariance)
+class Correction(NamedTuple):
+    """What frees an estimate of the bias that noise in the columns makes.
+
+    shift (n,): to add to it. lost, uncertain (n, n): to add to its covariance, where rows say little for noise and for
+    doubt about the shift.
+    """
+
+    shift: Array
+    lost: Array
+    uncertain: Array
+
+
+def _beside_lost(
+    directions: Array, along: Array, lost: Mask, attenuated: Array, beforehand: Array
+) -> tuple[Array, Array]:
+    """What changes where rows say little along directions: of the solution (k,) and its covariance (k, k).
+
+    directions (n, k): of unit information, with the solution `along` (k,). attenuated: how many deviations of rows
+    those that are lost to noise may be off. beforehand (n + 1, n + 1): the part of the normal equations that rows have
+    not made.
+    """
+    if not lost.any():
+        return np.zeros(along.size), np.zeros((along.size, along.size))
+    own = directions.T @ beforehand[:-1, :-1] @ directions
+    information, right = np.eye(along.size), along.copy()
+    # Rows that say nothing along a direction do not tie it to others.
+    information[lost] = own[lost]
+    information[:, lost] = own[:, lost]
+    rest = 1.0 / (1.0 + attenuated**2)
+    information[lost, lost] += rest
+    right[lost] = directions[:, lost].T @ beforehand[:-1, -1] + rest * along[lost]
+    covariance = np.linalg.inv(information)
+    return covariance @ right - along, covariance - np.eye(along.size)
+
+
+def unbiased(
+    estimate: Estimate, bias: NoiseBias, nuisances: Sequence[Nuisance] = (), lost_unknown: bool = False
+) -> Estimate:
+    """A least-squares estimate free of what noise in the columns does, and of contradicted tolerances of nuisances.
+
+    Nuisances come first. One that was weighted against a prior keeps the bias. See `NoiseBias.correction`, `released`.
+    """
+    squares = estimate.covariance
+    if estimate.scale is None:
+        found = bias.correction(estimate.determined, lost_unknown)
+        squares = squares + found.lost
+        estimate = replace(estimate, pi=estimate.pi + found.shift, covariance=squares + found.uncertain)
+    return released(estimate, nuisances, squares)

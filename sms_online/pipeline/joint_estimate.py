@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance, bound_rows, known_beforehand, prior_rows
-from sms_online.calibration.release import released
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.errors_in_variables import NoiseBias, unbiased
@@ -116,7 +115,7 @@ class JointEstimate(Stage):
         return self._unbiased(squares, lost_unknown) if scale_free is None else scale_free.solved(squares)
 
     def _unbiased(self, squares: Estimate, lost_unknown: bool = False) -> Estimate:
-        return released(unbiased(squares, self.bias, lost_unknown), self._nuisances, squares.covariance)
+        return unbiased(squares, self.bias, self._nuisances, lost_unknown)
 
     def row_variance(self, fit: MomentumFit) -> float:
         """Mean square of what the rows leave, in units of their predicted variance."""

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
-from sms_online.calibration.release import released
 from sms_online.description.schema import System, TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
@@ -155,10 +154,7 @@ class Statistics:
         if not setup.trackers[0].static:
             return self.momentum.trackers[0].estimate
         rows, scale_free = self.momentum.tracker.estimate(), self.momentum.scale_free
-        if scale_free is None:
-            joint = released(unbiased(rows, self.momentum.bias), setup.nuisances, rows.covariance)
-        else:
-            joint = scale_free.estimate(rows)
+        joint = unbiased(rows, self.momentum.bias, setup.nuisances) if scale_free is None else scale_free.estimate(rows)
         return joint.without_nuisances(len(setup.nuisances))
 
     def shift(self, estimate: Estimate) -> Array:
@@ -166,7 +162,7 @@ class Statistics:
         m = len(self.setup.nuisances)
         determined = np.concatenate((np.isfinite(estimate.nuisances_std), estimate.determined))
         assert self.momentum is not None
-        return self.momentum.bias.correction(determined)[0][m:]
+        return self.momentum.bias.correction(determined).shift[m:]
 
     @one_blas_thread()
     def energy_estimate(self) -> Estimate:

@@ -325,10 +325,11 @@ class TrackerBank(Stage):
         # An estimate that was weighted against a prior stays as it is, see `unbiased`.
         if estimate.scale is None and not self._weighted and estimate.rows > 0.0:
             # Noise in the columns pulls every weighted mean of the rows alike; the scatter of that grows as rows fade.
-            shift, covariance = bias.correction(estimate.determined)
+            found = bias.correction(estimate.determined)
             fewer = max(1.0, bias.windows * self._rows_a_window / estimate.rows)
-            estimate = replace(estimate, pi=estimate.pi + shift, covariance=estimate.covariance + fewer * covariance)
+            covariance = estimate.covariance + fewer * (found.lost + found.uncertain)
+            estimate = replace(estimate, pi=estimate.pi + found.shift, covariance=covariance)
         estimate = estimate.without_nuisances(self._nuisances)
-        found = tracker.found if isinstance(tracker, LearnedTrend) else ()
-        drifts = tuple(replace(drift, column=drift.column - self._nuisances) for drift in found)
+        learned = tracker.found if isinstance(tracker, LearnedTrend) else ()
+        drifts = tuple(replace(drift, column=drift.column - self._nuisances) for drift in learned)
         return Reading(chosen.choice.label, estimate, estimate.rows / self._rows_per_second, drifts)
