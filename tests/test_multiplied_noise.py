@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import sms_online as sms
-from sms_online.calibration.multiplied_noise import Multiplied, MultipliedNoise, Shares
+from sms_online.calibration.multiplied_noise import Multiplied, MultipliedNoise
+from sms_online.pipeline.errors_in_variables import NoiseBias
+from sms_online.pipeline.gram_sum import GramSum
 from sms_online.pipeline.momentum_windows import STEPS
 from sms_online.pipeline.row_noise import RowNoise
 
@@ -91,24 +93,29 @@ def test_synthetic_rows_have_the_covariance_of_the_noise() -> None:
     assert not rows[:, 1, 0].any()
 
 
-@pytest.mark.parametrize("stated", [1.0, 2.0])
-def test_a_cleaned_column_does_not_correlate_with_residuals(stated: float) -> None:
-    # Noise of a torque is 0.6 of a row's variance; positions' noise, the rest, may be stated too large.
+def test_noise_of_a_torque_does_not_pull_its_gain() -> None:
+    """Two joints whose torques one parameter makes, and a gain of the first, which is zero. Seed 2."""
     random = np.random.default_rng(2)
-    torque, positions = np.sqrt(0.6) * random.standard_normal(WINDOWS), random.standard_normal(WINDOWS) * np.sqrt(0.4)
-    deviation = np.sqrt(0.6 + 0.4 * stated)
-    column, residual = (10.0 + torque) / deviation, (torque + positions) / deviation
-    synthetic = np.sqrt(0.6) * random.standard_normal(WINDOWS) / deviation
-    shares = Shares([0], 1)
-    cleaned = np.array(
-        [
-            shares.taken_off(np.array([[a]]), np.array([[b]]), np.array([c]))[0, 0]
-            for a, b, c in zip(column, synthetic, residual, strict=True)
-        ]
-    )
-    noise = residual - residual.mean()
-    assert noise @ (column - column.mean()) > 0.4 * WINDOWS / deviation**2
-    assert abs(noise @ (cleaned - cleaned.mean())) < 0.05 * WINDOWS / deviation**2
+    torque, noise = 10.0 * random.standard_normal((WINDOWS, 1)), random.standard_normal((WINDOWS, 2))
+    synthetic = random.standard_normal((WINDOWS, 2))
+    Y, gained = torque * np.array([1.0, 0.5]), np.array([1.0, 0.0])
+    b = Y + noise
+    rows = np.stack([b * gained, Y, b], axis=2)
+    prior = np.array([[20.0, 0.0, 0.0]])
+    bias, grams = NoiseBias.none(2, prior, [0]), GramSum.none(2, 3, [0])
+    for each, own in zip(rows, synthetic * gained, strict=True):
+        bias.add(each, np.stack((each, each)), own[:, None])
+        grams.add(each[:, None], own[:, None])
+    everything = np.concatenate((prior, rows.reshape(-1, 3)))
+    squares = np.linalg.lstsq(everything[:, :2], everything[:, 2])[0]
+    freed = squares + bias.correction(np.array([True, True])).shift
+    gram = grams.matrices.sum(axis=0) + prior.T @ prior
+    solved = np.linalg.solve(gram[:2, :2], gram[:2, 2])
+    std = np.sqrt(np.linalg.inv(gram[:2, :2])[0, 0])
+    assert abs(freed[0]) < 2.0 * std
+    assert abs(solved[0]) < 2.0 * std
+    assert squares[0] > 8.0 * std
+    assert not bias.shift_by_columns(np.array([True, True])).any()
 
 
 @pytest.mark.slow

@@ -48,6 +48,7 @@ def after(errors: Array, known: int = 40, seed: int = 1) -> SequentialTest:
                 beta,
                 True,
                 np.empty((n_v, 0)),
+                np.empty((n_v, 0)),
             ),
             factor,
         )
@@ -122,7 +123,9 @@ def test_a_saved_test_goes_on_as_if_it_had_not_been() -> None:
         raw = np.column_stack((np.zeros((LAYOUT.n_v, N)), error))
         eye = np.eye(LAYOUT.n_v)
         none = np.empty((LAYOUT.n_v, 0))
-        rows = WhiteRows(raw, np.stack((raw, raw)), raw, eye, eye, k, none, np.zeros(LAYOUT.n_v), none[0], True, none)
+        rows = WhiteRows(
+            raw, np.stack((raw, raw)), raw, eye, eye, k, none, np.zeros(LAYOUT.n_v), none[0], True, none, none
+        )
         whole.push(rows, factor)
         if k >= 70:
             continued.push(rows, factor)

@@ -93,6 +93,11 @@ class Families:
         return tuple(out)
 
 
+def multiplying(sensing: Sensing) -> tuple[int, ...]:
+    """Numbers of the nuisances that multiply noise."""
+    return tuple(each.column for each in Families.of(sensing).multiplied if each.column is not None)
+
+
 def nuisances_of(families: Iterable[Family]) -> tuple[Nuisance, ...]:
     """Nuisances of some families, in their order."""
     return tuple(each for family in families for each in family.nuisances)

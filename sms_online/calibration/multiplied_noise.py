@@ -1,12 +1,14 @@
 """Noise that a nuisance multiplies: the column of a gain holds the noise of the very rows that it is fitted to.
 
 What a torque or a camera reads too large by is its reading times a gain, and the reading holds noise n, which is in the
-row's residual r too. With the column as it is, least squares take E[N r] = var n in every row for a gain, however the
-arm moves. N - E[n | r] is as good a column of the gain, and does not correlate with r.
-Source: Carroll, Ruppert, Stefanski and Crainiceanu, Measurement Error in Nonlinear Models, 2006, ch. 4 (regression
-calibration).
+row's residual r too. With the column N as it is, least squares take E[N r] = var n in every row for a gain, however the
+arm moves. Synthetic noise of the same sensors, whitened like the rows, gives var n. Normal equations are freed of it:
+Nᵀ N and Nᵀ b hold it, and nothing else does. That needs no estimate, whose residual is noise only once it is good.
+Source: Carroll, Ruppert, Stefanski and Crainiceanu, Measurement Error in Nonlinear Models, 2006, ch. 5 (corrected
+scores).
 
-How much of a whitened row's variance is of n follows from synthetic noise of the same sensors, whitened like the rows.
+Where a good estimate is at hand, N - E[n | r] is as good a column, and does not correlate with r (ibid., ch. 4,
+regression calibration): a diagnosis fits all rows before it judges a gain.
 """
 
 from __future__ import annotations
@@ -87,39 +89,6 @@ class MultipliedNoise(Stage):
                 column -= np.einsum("wkvs,wks->wv", kernels[..., seen], noise[..., seen], optimize=True)
             for i in each.joints:
                 column[:, self._joint_rows[i]] += torque[:, i]
-        return out
-
-
-class SharesState(State):
-    """Sums of squares over so many windows: of whitened synthetic rows (n_v, nuisances), and of residuals (n_v,)."""
-
-    synthetic: Array
-    residual: Array
-    windows: int = 0
-
-
-class Shares(Stage):
-    """Takes off the columns of nuisances what a row's residual says of the noise that they multiply."""
-
-    def __init__(self, columns: Sequence[int], n_v: int) -> None:
-        self._columns = list(columns)
-        self._n_v = n_v
-        self.begin()
-
-    def begin(self) -> None:
-        """Rows of other weights are next."""
-        self.state = SharesState(np.zeros((self._n_v, len(self._columns))), np.zeros(self._n_v))
-
-    def taken_off(self, N: Array, synthetic: Array, residual: Array) -> Array:
-        """N (n_v, ·) without what it shares with the residual (n_v,); synthetic (n_v, nuisances).
-
-        Rows are whitened, or divided by their deviations.
-        """
-        now = self.state
-        now.synthetic, now.residual = now.synthetic + synthetic**2, now.residual + residual**2
-        now.windows += 1
-        out = N.copy()
-        out[:, self._columns] -= shares(now.synthetic, now.residual, now.windows) * residual[:, None]
         return out
 
 

@@ -52,12 +52,13 @@ SUFFICIENT, HALVINGS = 1e-4, 30
 class Columns:
     """What the columns [N Y b] of rows belong to. nuisances: how many columns N has. gains: which are torques' gains.
 
-    inertial (m + n,): which are of inertial parameters.
+    inertial (m + n,): which are of inertial parameters. multiplying: which multiply noise, see `multiplied_noise`.
     """
 
     nuisances: int
     gains: tuple[int, ...]
     inertial: Mask
+    multiplying: tuple[int, ...] = ()
 
     def sharing(self, torque: bool) -> Mask:
         """Which columns (m + n + 1,) of rows with a torque, or of others, share their error.

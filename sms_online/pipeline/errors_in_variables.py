@@ -20,6 +20,7 @@ from scipy.special import stdtrit
 
 from sms_online.calibration.nuisance import Nuisance
 from sms_online.calibration.release import released
+from sms_online.pipeline.gram_sum import take_off
 from sms_online.state import State
 from sms_online.stream import Array, Mask
 from sms_online.trackers.interface import Estimate
@@ -41,7 +42,7 @@ class NoiseBias(State):
 
     gram (n + 1, n + 1): of rows [Y b]. beforehand: its part that was known before any row. whole: what additional noise
     changes, by clusters of `length` windows, in order of time; last: of the cluster that windows still join, `joined`
-    so far.
+    so far. multiplying: parameters that multiply noise, which b holds too; shared (k,): sum of its squares.
     """
 
     gram: Array
@@ -50,23 +51,36 @@ class NoiseBias(State):
     whole: list[Array] = msgspec.field(default_factory=list)
     length: int = CLUSTER
     joined: int = 0
+    multiplying: tuple[int, ...] = ()
+    shared: Array | None = None
 
     @staticmethod
-    def none(n: int, prior: Array | None = None) -> NoiseBias:
-        """Bias of no rows; prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise."""
+    def none(n: int, prior: Array | None = None, multiplying: Sequence[int] = ()) -> NoiseBias:
+        """Bias of no rows; prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise.
+
+        multiplying: parameters that multiply noise, see `multiplied_noise`.
+        """
         gram, last = np.zeros((2, n + 1, n + 1))
         if prior is not None:
             gram = prior.T @ prior
-        return NoiseBias(gram, gram.copy(), last)
+        return NoiseBias(gram, gram.copy(), last, multiplying=tuple(multiplying))
 
-    def add(self, rows: Array, noisy: Array) -> None:
-        """Rows [Y b] (M, n + 1) of a window, and the same with noise added and subtracted (2, M, n + 1)."""
+    def add(self, rows: Array, noisy: Array, shared: Array | None = None) -> None:
+        """Rows [Y b] (M, n + 1) of a window, and the same with noise added and subtracted (2, M, n + 1).
+
+        shared (M, ·): a sample of what parameters multiply: noise of their columns, and of b.
+        """
         gram = rows.T @ rows
         self.gram = self.gram + gram
         if self.joined == 0 and len(self.whole) == MOST_CLUSTERS:
             self.whole = [one + other for one, other in zip(self.whole[::2], self.whole[1::2], strict=True)]
             self.length *= 2
-        self.last = self.last + (0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram)
+        changed = 0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram
+        if shared is not None and self.multiplying:
+            squares = np.sum(shared**2, axis=0)
+            take_off(changed, self.multiplying, -squares)
+            self.shared = squares if self.shared is None else self.shared + squares
+        self.last = self.last + changed
         self.joined = (self.joined + 1) % self.length
         if self.joined == 0:
             self.whole.append(self.last)
@@ -81,6 +95,15 @@ class NoiseBias(State):
     def _clusters(self) -> Array:
         """All of them (C, n + 1, n + 1), in order of time."""
         return np.array(self.whole if self.joined == 0 else [*self.whole, self.last]).reshape(-1, *self.gram.shape)
+
+    def shift_by_columns(self, determined: Mask) -> Array:
+        """The shift (n,) that noise in the columns asks for beside what parameters multiply, which is known exactly."""
+        if self.shared is None:
+            return self.correction(determined).shift
+        gram, clusters = self.gram.copy(), self._clusters
+        take_off(gram, self.multiplying, self.shared)
+        take_off(clusters, self.multiplying, self.shared / len(clusters))
+        return NoiseBias(gram, self.beforehand, np.zeros_like(gram), list(clusters)).correction(determined).shift
 
     def correction(self, determined: Mask, lost_unknown: bool = False) -> Correction:
         """What to add to the least-squares estimate to free it of this bias, and to its covariance.

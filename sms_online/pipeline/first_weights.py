@@ -104,9 +104,9 @@ class FirstWeights:
             for _ in range(2):
                 white = whiten(joint[m:])
                 plain.judge(joint)
-            grams = RowGrams.none(n_v, self._nominal.size, m)
+            grams = RowGrams.none(n_v, self._nominal.size, m, self._columns.multiplying)
             for each in white:
-                grams.add(each.Y, each.noisy)
+                grams.add(each.Y, each.noisy, each.multiplied)
             lacking, starts = (plain.misfit > 0.0) | self._gained, [joint]
         return self._least(grams, lacking, starts)[m:]
 

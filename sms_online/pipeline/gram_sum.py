@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import msgspec
@@ -21,16 +22,19 @@ ROUNDED = 16.0
 class GramSum(State):
     """Sum of Gram matrices, and the rows of the last windows, which are not in it yet.
 
-    total (n_v, n, n). waiting: rows (n_v, k, n) of each window.
+    total (n_v, n, n). waiting: rows (n_v, k, n) of each window. less (n_v, c): squares that are to be taken off the
+    products of columns with themselves and with the last one, see `multiplied_noise`.
     """
 
     total: Array
     waiting: list[Array] = msgspec.field(default_factory=list)
+    columns: tuple[int, ...] = ()
+    less: Array | None = None
 
     @staticmethod
-    def none(n_v: int, n: int) -> GramSum:
-        """Sums of no rows with n columns, of n_v speeds."""
-        return GramSum(np.zeros((n_v, n, n)))
+    def none(n_v: int, n: int, columns: Sequence[int] = ()) -> GramSum:
+        """Sums of no rows with n columns, of n_v speeds; columns: those that share noise with the last one."""
+        return GramSum(np.zeros((n_v, n, n)), [], tuple(columns), np.zeros((n_v, len(columns))) if columns else None)
 
     @property
     def matrices(self) -> Array:
@@ -39,17 +43,34 @@ class GramSum(State):
             return self.total
         # In one order in memory, whichever they came in: it decides on the last bits.
         rows = np.ascontiguousarray(np.concatenate(self.waiting, axis=1))
-        return np.asarray(self.total + rows.swapaxes(1, 2) @ rows)
+        out = np.asarray(self.total + rows.swapaxes(1, 2) @ rows)
+        if self.less is not None:
+            take_off(out, self.columns, self.less)
+        return out
 
-    def add(self, rows: Array) -> None:
-        """Rows (n_v, k, n) of a window, k of each speed."""
+    def add(self, rows: Array, shared: Array | None = None) -> None:
+        """Rows (n_v, k, n) of a window, k of each speed; shared (n_v, c): noise that columns have and the last one."""
         self.waiting.append(rows)
+        if self.less is not None and shared is not None:
+            self.less = self.less + shared**2
         if len(self.waiting) == GATHERED:
-            self.total, self.waiting = self.matrices, []
+            self._gather(self.matrices)
+
+    def _gather(self, matrices: Array) -> None:
+        self.total, self.waiting = matrices, []
+        self.less = None if self.less is None else np.zeros_like(self.less)
 
     def scale(self, share: Array) -> None:
         """Have the rows so far count so much, (n_v,) of their squares."""
-        self.total, self.waiting = share[:, None, None] * self.matrices, []
+        self._gather(share[:, None, None] * self.matrices)
+
+
+def take_off(grams: Array, columns: Sequence[int], squares: Array) -> None:
+    """Take squares (…, c) off the products of columns with themselves and with the last one, in grams (…, n, n)."""
+    at = list(columns)
+    grams[..., at, at] -= squares
+    grams[..., at, -1] -= squares
+    grams[..., -1, at] -= squares
 
 
 class PackedGrams(State):

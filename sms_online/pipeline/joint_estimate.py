@@ -42,9 +42,10 @@ class JointEstimateState(State):
 class JointEstimate(Stage):
     """Sums of one session's rows [N Y b], from one event to the next.
 
-    prior: of the parameters, None where there is none; within: what the estimate goes on from holds it. tracker: fed
-    with rows of unit variance, all of which count alike. bias: what noise in the columns does to its estimate. grams:
-    sums of rows by generalized speed, for an estimate where they leave more than noise.
+    multiplying: nuisances that multiply noise. prior: of the parameters, None where there is none; within: what the
+    estimate goes on from holds it. tracker: fed with rows of unit variance, all of which count alike. bias: what noise
+    in the columns does to its estimate. grams: sums of rows by generalized speed, for an estimate where they leave more
+    than noise.
     """
 
     def __init__(
@@ -52,11 +53,12 @@ class JointEstimate(Stage):
         model: Model,
         base: BaseParameters,
         nuisances: Sequence[Nuisance],
+        multiplying: Sequence[int],
         prior: Prior | None,
         within: bool = False,
     ) -> None:
         self._nuisances, self._prior, self._within = tuple(nuisances), prior, within
-        self._n, self._n_v = base.n, model.layout.n_v
+        self._n, self._n_v, self._multiplying = base.n, model.layout.n_v, tuple(multiplying)
         self._calibration = prior_rows(self._nuisances, base.n)
         self._gains = plausible_gains(model, base, len(self._nuisances))
         self.tracker: Tracker = session_tracker(base.n, prior, len(self._nuisances), within)
@@ -68,8 +70,9 @@ class JointEstimate(Stage):
         self.state = JointEstimateState(np.zeros((0, len(self._nuisances) + base.n + 1)), np.zeros(self._n_v))
 
     def _new_sums(self) -> tuple[NoiseBias, RowGrams]:
-        columns = len(self._nuisances) + self._n
-        return NoiseBias.none(columns, self._calibration), RowGrams.none(self._n_v, self._n, len(self._nuisances))
+        m = len(self._nuisances)
+        bias = NoiseBias.none(m + self._n, self._calibration, self._multiplying)
+        return bias, RowGrams.none(self._n_v, self._n, m, self._multiplying)
 
     def begin_behind_event(self, known: Information, bias: NoiseBias) -> None:
         """Go on with what is known from before an event, and what noise in the columns did by then."""
@@ -91,13 +94,13 @@ class JointEstimate(Stage):
         """Take in the rows of a window that ends at t, s."""
         self._kept, M = None, rows.Y.shape[0]
         self.tracker.update(Rows(rows.Y[:, :-1], rows.Y[:, -1], np.ones(M), np.full(M, t)))
-        self.bias.add(rows.Y, rows.noisy)
+        self.bias.add(rows.Y, rows.noisy, rows.multiplied)
         now, before = self.state, self.state.weights
         if before is None or np.any(rows.misfit != now.misfit) or np.any(rows.weights != before):
             if before is not None:
                 self.grams.whiten_anew((before, now.misfit), (rows.weights, rows.misfit))
             now.weights, now.misfit = rows.weights, rows.misfit
-        self.grams.add(rows.Y, rows.noisy)
+        self.grams.add(rows.Y, rows.noisy, rows.multiplied)
 
     def estimate(self, fit: MomentumFit) -> Estimate:
         """The nuisances, then the base parameters; fit: that the rows come from."""

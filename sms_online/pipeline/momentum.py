@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 import numpy as np
 
+from sms_online.calibration.channels import multiplying
 from sms_online.calibration.columns import CalibrationColumns
 from sms_online.calibration.nuisance import Nuisance, prior_rows
 from sms_online.description.schema import TrackerChoice
@@ -108,7 +109,8 @@ class Momentum(Stage):
     def _build(self) -> None:
         """Empty stages for the current model and parameters, but for the trackers that were chosen."""
         model, base = self.changes.model, self.changes.base
-        self.joint = JointEstimate(model, base, self.nuisances, self.current_prior, self.state.prior_within)
+        multiply = multiplying(self.sensing)
+        self.joint = JointEstimate(model, base, self.nuisances, multiply, self.current_prior, self.state.prior_within)
         self._balance = MomentumBalance(model, base, self._sample_rate, self._span, moments=self.bank.follows)
         self.latencies = Latencies(self._sources, base.n)
         self.fit = MomentumFit(

@@ -123,9 +123,11 @@ class MomentumFit(Stage):
         inertial = np.isin(
             np.arange(-self._nuisances, base.n), np.flatnonzero(np.isin(base.independent, model.inertial))
         )
-        self.columns = Columns(self._nuisances, tuple(gains), inertial)
+        self._balance, self._new_noise, self._sources = balance, new_noise, sources
+        self.whitening = self._new_whitening()
+        self._next: WindowWhitening | None = None  # with new weights; takes over when it has received enough windows
+        self.columns = Columns(self._nuisances, tuple(gains), inertial, self.whitening.noise.multiplied)
         self.described = described(model, base)
-        self._balance = balance
         self._solve, self._drift = solve, drift
         self._prior_information = (
             prior_information
@@ -138,15 +140,12 @@ class MomentumFit(Stage):
         self._first_weights = FirstWeights(
             self.described[0], self._calibration, self.columns, self.torque, self._gained, self._prior_information
         )
-        self._new_noise, self._sources = new_noise, sources
-        self.whitening = self._new_whitening()
-        self._next: WindowWhitening | None = None  # with new weights; takes over when it has received enough windows
         layout = model.layout
         widths = (layout.n_x, layout.n_v, model.n_signals)
         x, v, signals = (np.empty((0, columns)) for columns in widths)
         self.state = MomentumFitState(x, v, signals)
         self._errors = RowErrors(layout.n_v)
-        self.plain = PlainRows.none(layout.n_v, base.n, self._nuisances)
+        self.plain = PlainRows.none(layout.n_v, base.n, self._nuisances, self.columns.multiplying)
 
     def renew(self) -> None:
         """See Stage."""
@@ -258,8 +257,6 @@ class MomentumFit(Stage):
         elif self._next is None and self._matters(beta, noise):
             self._next, self.state.warm = self._new_whitening(), 0
             self._next.begin(beta, noise, self.plain.misfit, window.start)
-        for whitening in self._whitenings:
-            whitening.refer(joint - np.pad(self._point(), (0, self.base.n)))
 
     def _calibrated(self, joint: Array) -> Array:
         """Nuisances and β (m + n,) that leave no more than noise, where tolerances allow that; or the same.
@@ -354,13 +351,13 @@ class MomentumFit(Stage):
         raw, white = np.ascontiguousarray(raw), np.ascontiguousarray(white)
         out = []
         for k, (window, each) in enumerate(zip(windows, whitened, strict=True)):
-            self.plain.add(raw[k], noisy[k], np.diag(each.noise), weights)
+            self.plain.add(raw[k], noisy[k], np.diag(each.noise), weights, each.multiplied[0])
             unsteady = np.diag(UNSTEADY * samples[k] ** 2)
             covariance, noise = each.covariance + unsteady, each.noise + unsteady
             out.append(
                 WhiteRows(
                     white[k, 0], white[k, 1:], raw[k], covariance, noise, window.end, each.late, misfit,
-                    self._known_weights, self._moves(window, sensors), ramp[k], drifts[k],
+                    self._known_weights, self._moves(window, sensors), ramp[k], each.multiplied[1], drifts[k],
                 )
             )  # fmt: skip
         return out

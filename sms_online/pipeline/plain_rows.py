@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import chdtri
 
@@ -34,9 +36,10 @@ class PlainRows(State):
     patient: bool = False
 
     @staticmethod
-    def none(n_v: int, n: int, nuisances: int = 0) -> PlainRows:
-        """Sums of no windows, with rows of n_v speeds, n parameters and m nuisances."""
-        return PlainRows(GramSum.none(n_v, nuisances + n + 1), GramSum.none(n_v, n + 1), *np.zeros((2, n_v)))
+    def none(n_v: int, n: int, nuisances: int = 0, multiplying: Sequence[int] = ()) -> PlainRows:
+        """Sums of no windows, with rows of n_v speeds, n parameters and m nuisances; multiplying: noise, of these."""
+        signal = GramSum.none(n_v, nuisances + n + 1, multiplying)
+        return PlainRows(signal, GramSum.none(n_v, n + 1), *np.zeros((2, n_v)))
 
     @property
     def gram(self) -> Array:
@@ -45,17 +48,20 @@ class PlainRows(State):
 
     def clear(self) -> None:
         """Forget the windows, not the misfit."""
-        self.grams, self.noise = (GramSum.none(*each.total.shape[:2]) for each in (self.grams, self.noise))
+        self.grams, self.noise = (
+            GramSum.none(len(each.total), each.total.shape[1], each.columns) for each in (self.grams, self.noise)
+        )
         self.at_weights, self.windows = np.zeros_like(self.at_weights), 0
 
-    def add(self, rows: Array, noise: Array, variance: Array, weights: Array) -> None:
+    def add(self, rows: Array, noise: Array, variance: Array, weights: Array, multiplied: Array | None = None) -> None:
         """Rows [N Y b] (n_v, m + n + 1) of a window, and what noise does to [Y b] of it.
 
-        noise (n_v, n + 1): a sample; variance (n_v,): of the rows with weights (n,).
+        noise (n_v, n + 1): a sample; variance (n_v,): of the rows with weights (n,). multiplied (n_v, ·): a sample of
+        what nuisances multiply, see `multiplied_noise`.
         """
         std = np.sqrt(variance)[:, None]
         sample = noise / std
-        self.grams.add((rows / std)[:, None])
+        self.grams.add((rows / std)[:, None], None if multiplied is None else multiplied / std)
         self.noise.add(sample[:, None])
         self.at_weights = self.at_weights + (sample @ np.append(weights, -1.0)) ** 2
         self.windows += 1

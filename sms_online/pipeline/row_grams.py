@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import msgspec
 import numpy as np
@@ -48,15 +48,21 @@ class RowGrams(State):
     length: int = SHORTEST_BLOCK
 
     @staticmethod
-    def none(n_v: int, n: int, nuisances: int = 0) -> RowGrams:
-        """Gram matrices of no windows, with rows of n_v speeds, n parameters and m nuisances."""
-        return RowGrams(GramSum.none(n_v, nuisances + n + 1), GramSum.none(n_v, n + 1))
+    def none(n_v: int, n: int, nuisances: int = 0, multiplying: Sequence[int] = ()) -> RowGrams:
+        """Gram matrices of no windows, with rows of n_v speeds, n parameters and m nuisances.
 
-    def add(self, rows: Array, noisy: Array) -> None:
-        """Rows [N Y b] (n_v, m + n + 1) of a window; noisy (2, n_v, m + n + 1): with synthetic noise, and less it."""
+        multiplying: those that multiply noise.
+        """
+        return RowGrams(GramSum.none(n_v, nuisances + n + 1, multiplying), GramSum.none(n_v, n + 1))
+
+    def add(self, rows: Array, noisy: Array, shared: Array | None = None) -> None:
+        """Rows [N Y b] (n_v, m + n + 1) of a window; noisy (2, n_v, m + n + 1): with synthetic noise, and less it.
+
+        shared (n_v, ·): a sample of what nuisances multiply, see `multiplied_noise`.
+        """
         of_noise = slice(self.nuisances, None)
         plus, minus, between = noisy[0, :, of_noise], noisy[1, :, of_noise], rows[:, of_noise]
-        self.signal.add(rows[:, None])
+        self.signal.add(rows[:, None], shared)
         self.noise.add(np.stack((0.5 * (plus - minus), 0.5 * (plus + minus) - between), axis=1))
         self.windows += 1
         if self.windows % self.length == 0:

@@ -18,7 +18,8 @@ class WhiteRows:
     window's last sample. late (n_v, G): columns of the sources' latencies, independent like Y. misfit (n_v,): what the
     model lacks in each row, over the variance of its noise, as far as it is in the covariance. weights (n,): β behind
     the covariance. moves: whether the arm does in the window. ramp (n_v, n): columns of the parameters' rates about the
-    window's centre, independent like Y; none where nobody asked. drift: the known drift there, of which b is free.
+    window's centre, independent like Y; none where nobody asked. multiplied (n_v, ·): a sample of the noise that
+    nuisances multiply, independent like Y. drift: the known drift there, of which b is free.
     """
 
     Y: Array
@@ -32,4 +33,5 @@ class WhiteRows:
     weights: Array
     moves: bool
     ramp: Array
+    multiplied: Array
     drift: DriftLine | None = None

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.calibration.multiplied_noise import Shares
 from sms_online.pipeline.latency import LatencyColumns, SourceGroup
 from sms_online.pipeline.momentum_windows import Window
 from sms_online.pipeline.sensor_noise import SensorNoise
@@ -28,26 +27,23 @@ class WhitenedWindow:
     """A window's rows (n_v, width), independent of all before and of each other, errors of unit variance.
 
     late (n_v, G): columns of the sources' latencies, likewise. calibration (n_v, m), twice: columns of what the
-    description may be wrong in, as they came and likewise. noise (n_v, n_v): covariance of the rows as they came, as
-    far as it is noise; covariance (n_v, n_v): with what the model lacks.
+    description may be wrong in, as they came and likewise. multiplied (n_v, ·), twice: a sample of the noise that some
+    of these multiply. noise (n_v, n_v): covariance of the rows as they came, as far as it is noise; covariance (n_v,
+    n_v): with what the model lacks.
     """
 
     rows: Array
     late: Array
     calibration: tuple[Array, Array]
+    multiplied: tuple[Array, Array]
     noise: Array
     covariance: Array
 
 
 class WindowWhiteningState(State):
-    """What weights were begun with.
-
-    misfit (n_v,): variance of what the model lacks in each row, over that of the noise. reference (m + n,): nuisances
-    and β of the newest estimate, which residuals are of.
-    """
+    """misfit (n_v,): variance of what the model lacks in each row, over that of the noise."""
 
     misfit: Array
-    reference: Array
 
 
 class WindowWhitening(Stage):
@@ -59,11 +55,9 @@ class WindowWhitening(Stage):
 
     def __init__(self, noise: WindowNoise, width: int, sources: Sequence[SourceGroup] = ()) -> None:
         self.noise = noise
-        self.state = WindowWhiteningState(np.zeros(noise.n_v), np.zeros(noise.nuisances))
+        self.state = WindowWhiteningState(np.zeros(noise.n_v))
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(width + len(sources) + noise.nuisances + len(noise.multiplied))
-        self._plain_shares = Shares(noise.multiplied, noise.n_v)
-        self._shares = Shares(noise.multiplied, noise.n_v)
 
     @property
     def misfit(self) -> Array:
@@ -80,11 +74,9 @@ class WindowWhitening(Stage):
 
         misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
         """
-        self.state.misfit, self.state.reference = misfit, np.append(np.zeros(self.noise.nuisances), beta)
+        self.state.misfit = misfit
         self.noise.begin(beta, noise, instant)
         self._whitener.begin_segment()
-        self._plain_shares.begin()
-        self._shares.begin()
 
     def begin_segment(self) -> None:
         """The next window begins a segment, and shares no samples with those before."""
@@ -108,21 +100,8 @@ class WindowWhitening(Stage):
             rows = np.concatenate((rows, self._late.of(noise.late)), axis=1)
         rows = np.concatenate((rows, noise.calibration, noise.multiplied), axis=1)
         white = self._whitener.push(noise.covariances, rows)
-        calibration = noise.calibration, white[:, calibrated : calibrated + noise.calibration.shape[1]]
-        if len(self.noise.multiplied):
-            std = np.sqrt(np.diag(own))[:, None]
-            synthetic = white[:, -len(self.noise.multiplied) :]
-            plain, whitened = calibration[0] / std, calibration[1]
-            residuals = self._residual(rows / std, plain), self._residual(white, whitened)
-            plain = self._plain_shares.taken_off(plain, noise.multiplied / std, residuals[0])
-            calibration = std * plain, self._shares.taken_off(whitened, synthetic, residuals[1])
-        return WhitenedWindow(white[:, :width], white[:, width:calibrated], calibration, of_noise, own)
-
-    def refer(self, joint: Array) -> None:
-        """Take the newest estimate of nuisances, beside those that samples are corrected by, and of β (m + n,)."""
-        self.state.reference = joint
-
-    def _residual(self, rows: Array, N: Array) -> Array:
-        """What rows [Y b …] (n_v, ·) leave with the newest estimate."""
-        nuisances, beta = np.split(self.state.reference, [N.shape[1]])
-        return np.asarray(rows[:, beta.size] - rows[:, : beta.size] @ beta - N @ nuisances)
+        multiplied = calibrated + noise.calibration.shape[1]
+        return WhitenedWindow(
+            white[:, :width], white[:, width:calibrated], (noise.calibration, white[:, calibrated:multiplied]),
+            (noise.multiplied, white[:, multiplied:]), of_noise, own,
+        )  # fmt: skip
