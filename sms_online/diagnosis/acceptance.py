@@ -8,7 +8,7 @@ import numpy as np
 
 from sms_online.diagnosis.folds import Fall, fall
 from sms_online.diagnosis.held_out_rows import HeldOutRows
-from sms_online.stream import Array
+from sms_online.stream import Array, Mask
 
 # Coefficients of effects that are correlated by more than this are those of one effect too many.
 LARGEST_CORRELATION = 0.99
@@ -35,13 +35,24 @@ class Acceptance(HeldOutRows):
         traits = self.candidates[k].traits
         return ACROSS_CAPTURES if self.folds.across and not traits.learned else traits.least_improvement
 
+    def _judging(self, k: int) -> Mask:
+        """Speeds (n_v,) whose rows judge a candidate: those that it acts on; for a gain, those of all torques.
+
+        Parameters of a joint's own links follow the gain of its torque, so that rows of other joints contradict it.
+        """
+        acts = self._acts(k)
+        return acts | np.any(self.rows.b, axis=0) if self._is_gain(k) else acts
+
+    def _is_gain(self, k: int) -> bool:
+        return "drive_gain" in self.candidates[k].traits.calibrates
+
     def improves(self, chosen: Sequence[int], candidate: int) -> bool:
         """Whether a candidate beside those chosen lowers the residual of held-out rows, and no other type's rises.
 
         Or that of all rows together by much: what else is lacking may have drawn the fit to the rows that it acts on.
         """
         together, least = [*chosen, candidate], self.least_improvement(candidate)
-        acts = self._acts(candidate)
+        acts = self._judging(candidate)
         before, after = (self.fitted(each, chosen) for each in (chosen, together))
         if not self.floor.any() and fall(before.sum(axis=1), after.sum(axis=1)).share >= MUCH:
             held = (self.held_out(each, chosen).sum(axis=1) for each in (chosen, together))
@@ -67,7 +78,7 @@ class Acceptance(HeldOutRows):
 
         Of calibration the same is held before and after, so that the candidate alone makes the difference.
         """
-        acts = self._acts(candidate)
+        acts = self._judging(candidate)
         before, after = (self.held_out(each, chosen) for each in (chosen, [*chosen, candidate]))
         return fall(before[:, acts].sum(axis=1), after[:, acts].sum(axis=1))
 
@@ -130,6 +141,8 @@ class Acceptance(HeldOutRows):
                 continue
             others = effects.copy()
             others[own] = False
+            if self._is_gain(k):
+                others[: self.n_model] = False  # a gain scales friction of its joint as it scales its links
             if not np.all(known[own]) or np.any(np.abs(correlation[own][:, others]) > LARGEST_CORRELATION):
                 out.append(k)
         return out

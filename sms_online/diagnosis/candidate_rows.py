@@ -218,6 +218,8 @@ class CandidateRows(CandidateFits):
         if not gained:
             return
         beside = np.concatenate([self._white, *(self._Z[k] for k in self._beside), self._N], axis=1)
+        m = self.calibrated.count
+        beside[len(beside) - m :, beside.shape[1] - m :] = self.calibrated.information(np.zeros(m, dtype=np.bool_))
         residual = (self._white_b - beside @ least_squares(beside, self._white_b))[:size].reshape(self.rows.b.shape)
         squares = np.sum(synthetic**2, axis=0), np.sum(residual**2, axis=0)
         expected = (shares(*squares, len(synthetic)) * residual[:, :, None]).reshape(size, -1)

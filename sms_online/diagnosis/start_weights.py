@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.diagnosis.candidate import Candidate
-from sms_online.diagnosis.evidence import together
+from sms_online.diagnosis.evidence import least_squares, together
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
 from sms_online.diagnosis.scale_free import NEAR
@@ -50,8 +50,14 @@ def first_weights(
 
 
 def _at_noise(rows: SessionRows) -> bool:
-    """Whether the parameters that rows are whitened with leave no more than noise."""
-    left = (rows.b - rows.Y @ rows.beta) / rows.std
+    """Whether the parameters that rows are whitened with leave no more than noise, beside what is calibrated."""
+    left, calibrated = (rows.b - rows.Y @ rows.beta) / rows.std, rows.calibrated
+    if calibrated.count:
+        columns = (calibrated.columns / rows.std[..., None]).reshape(left.size, -1)
+        known = calibrated.information(np.zeros(calibrated.count, dtype=np.bool_))
+        both = np.concatenate((columns, known))
+        nuisances = least_squares(both, np.concatenate((left.ravel(), np.zeros(calibrated.count))))
+        left = left - (columns @ nuisances).reshape(left.shape)
     return not any(row.beyond for row in ResidualTest(rows).of(left).values())
 
 

@@ -329,8 +329,8 @@ class Momentum(Stage):
     def _follow(self, rows: WhiteRows) -> None:
         """Hand rows to the chosen trackers, and to what watches for drifts."""
         before, noise = self.bank.accepted, self.state.sensor_noise
-        # Rounding moves as it likes where samples are exact.
-        quiet = not self.misfit and noise is not None and not noise.exact
+        # Rounding moves as it likes where samples are exact, and least squares where a torque's gain is a parameter.
+        quiet = not self.fit.lacking.any() and noise is not None and not noise.exact
         self.bank.update(self._followed(rows), quiet, rows.moves)
         self.fit.plain.patient = self.state.patient and self.bank.patient
         if self.bank.accepted > before:
