@@ -1,14 +1,14 @@
 """Noise that a nuisance multiplies: the column of a gain holds the noise of the very rows that it is fitted to.
 
 What a torque or a camera reads too large by is its reading times a gain, and the reading holds noise n, which is in the
-row's residual r too. With the column N as it is, least squares take E[N r] = var n in every row for a gain, however the
-arm moves. Synthetic noise of the same sensors, whitened like the rows, gives var n. Normal equations are freed of it:
-Nᵀ N and Nᵀ b hold it, and nothing else does. That needs no estimate, whose residual is noise only once it is good.
-Source: Carroll, Ruppert, Stefanski and Crainiceanu, Measurement Error in Nonlinear Models, 2006, ch. 5 (corrected
-scores).
+row's residual r too. With the column as it is, least squares take E[N r] = var n in every row for a gain, however the
+arm moves. N - E[n | r] is as good a column of the gain, and does not correlate with r.
+Source: Carroll, Ruppert, Stefanski and Crainiceanu, Measurement Error in Nonlinear Models, 2006, ch. 4 (regression
+calibration).
 
-Where a good estimate is at hand, N - E[n | r] is as good a column, and does not correlate with r (ibid., ch. 4,
-regression calibration): a diagnosis fits all rows before it judges a gain.
+How much of a whitened row's variance is of n follows from synthetic noise of the same sensors, whitened like the rows.
+Where the residual is far more than noise, as in first windows, nothing follows from it. There var n itself is taken off
+the products Nᵀ N and Nᵀ b of the normal equations (ibid., ch. 5 and 7, corrected scores).
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from sms_online.pipeline.weak_form import test_function
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
+# Deviations of a row that noise makes.
+LARGEST = 4.0
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 11
 
@@ -92,7 +94,42 @@ class MultipliedNoise(Stage):
         return out
 
 
-def shares(synthetic: Array, residual: Array, windows: int) -> Array:
+class SharesState(State):
+    """Sums of squares over windows (n_v,): of whitened synthetic rows (n_v, nuisances), and of residuals (n_v,)."""
+
+    synthetic: Array
+    residual: Array
+    windows: Array
+
+
+class Shares(Stage):
+    """Takes off the columns of nuisances what a row's residual says of the noise that they multiply."""
+
+    def __init__(self, columns: Sequence[int], n_v: int) -> None:
+        self._columns = list(columns)
+        self._n_v = n_v
+        self.begin()
+
+    def begin(self) -> None:
+        """Rows of other weights are next."""
+        self.state = SharesState(np.zeros((self._n_v, len(self._columns))), *np.zeros((2, self._n_v)))
+
+    def taken_off(self, N: Array, synthetic: Array, residual: Array) -> tuple[Array, Array]:
+        """N (n_v, ·) without what it shares with the residual (n_v,), and the noise (n_v, nuisances) that stays in it.
+
+        synthetic (n_v, nuisances): a sample of that noise; rows are whitened, or divided by their deviations. Of a
+        residual that noise does not make, as of an estimate from a few rows, nothing follows: there all of it stays.
+        """
+        now, noise = self.state, np.abs(residual) < LARGEST
+        own = np.where(noise, residual, 0.0)
+        now.synthetic, now.residual = now.synthetic + noise[:, None] * synthetic**2, now.residual + own**2
+        now.windows = now.windows + noise
+        out = N.copy()
+        out[:, self._columns] -= shares(now.synthetic, now.residual, now.windows) * own[:, None]
+        return out, synthetic * ~noise[:, None]
+
+
+def shares(synthetic: Array, residual: Array, windows: float | Array) -> Array:
     """Shares (n_v, nuisances) of noise in the residuals of rows, from sums of squares over windows: `SharesState`.
 
     Residuals larger than noise makes them are those of a poor fit; smaller ones mean that noise is overstated.

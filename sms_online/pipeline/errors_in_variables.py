@@ -22,7 +22,7 @@ from sms_online.calibration.nuisance import Nuisance
 from sms_online.calibration.release import released
 from sms_online.pipeline.gram_sum import take_off
 from sms_online.state import State
-from sms_online.stream import Array, Mask
+from sms_online.stream import Array, Indices, Mask
 from sms_online.trackers.interface import Estimate
 
 # Windows that share samples answer for noise together; a cluster is of windows side by side.
@@ -33,6 +33,9 @@ EVIDENCE = 0.97725
 # share would be large ones of the correction. What it would be counts as a deviation, so many times the estimate at
 # most.
 LARGEST_SHARE, LARGEST_FACTOR = 0.5, 100.0
+# What a parameter multiplies is taken off but for this share of the information along a direction, or so many times
+# what a sample of it scatters by.
+LEAST_LEFT, SCATTER = 0.02, 2.0
 # When there are so many clusters, neighbours merge.
 MOST_CLUSTERS = 128
 
@@ -40,13 +43,12 @@ MOST_CLUSTERS = 128
 class NoiseBias(State):
     """Gathers normal equations with and without additional noise, in columns and right-hand sides.
 
-    gram (n + 1, n + 1): of rows [Y b]. beforehand: its part that was known before any row. whole: what additional noise
-    changes, by clusters of `length` windows, in order of time; last: of the cluster that windows still join, `joined`
-    so far. multiplying: parameters that multiply noise, which b holds too; shared (k,): sum of its squares.
+    gram (n + 1, n + 1): of rows [Y b]. whole: what additional noise changes, by clusters of `length` windows, in order
+    of time; last: of the cluster that windows still join, `joined` so far. multiplying: parameters that multiply noise,
+    which b holds too; shared (k,): sum of its squares, see `multiplied_noise`.
     """
 
     gram: Array
-    beforehand: Array
     last: Array
     whole: list[Array] = msgspec.field(default_factory=list)
     length: int = CLUSTER
@@ -58,12 +60,10 @@ class NoiseBias(State):
     def none(n: int, prior: Array | None = None, multiplying: Sequence[int] = ()) -> NoiseBias:
         """Bias of no rows; prior (k, n + 1): what is known beforehand, as rows [Y b] of unit variance without noise.
 
-        multiplying: parameters that multiply noise, see `multiplied_noise`.
+        multiplying: parameters that multiply noise.
         """
         gram, last = np.zeros((2, n + 1, n + 1))
-        if prior is not None:
-            gram = prior.T @ prior
-        return NoiseBias(gram, gram.copy(), last, multiplying=tuple(multiplying))
+        return NoiseBias(gram if prior is None else prior.T @ prior, last, multiplying=tuple(multiplying))
 
     def add(self, rows: Array, noisy: Array, shared: Array | None = None) -> None:
         """Rows [Y b] (M, n + 1) of a window, and the same with noise added and subtracted (2, M, n + 1).
@@ -96,18 +96,10 @@ class NoiseBias(State):
         """All of them (C, n + 1, n + 1), in order of time."""
         return np.array(self.whole if self.joined == 0 else [*self.whole, self.last]).reshape(-1, *self.gram.shape)
 
-    def shift_by_columns(self, determined: Mask) -> Array:
-        """The shift (n,) that noise in the columns asks for beside what parameters multiply, which is known exactly."""
-        if self.shared is None:
-            return self.correction(determined).shift
-        gram, clusters = self.gram.copy(), self._clusters
-        take_off(gram, self.multiplying, self.shared)
-        take_off(clusters, self.multiplying, self.shared / len(clusters))
-        return NoiseBias(gram, self.beforehand, np.zeros_like(gram), list(clusters)).correction(determined).shift
-
     def correction(self, determined: Mask, lost_unknown: bool = False) -> Correction:
         """What to add to the least-squares estimate to free it of this bias, and to its covariance.
 
+        What parameters multiply is known, and is taken off the normal equations before all else.
         The synthetic noise is one sample, so the shift scatters. As much of it is given as is no scatter: a bias that
         many clusters agree on counts, one that few of them make shrinks to zero as James and Stein's estimate does.
         What it shrinks by may be bias all the same, and counts as a deviation.
@@ -117,19 +109,23 @@ class NoiseBias(State):
         score by the same function of a noise of the same law. Even orders of Gaussian noise do not correlate with odd
         ones, so the variances add: that of the second order to that of the first, and to both that of the shift.
         Where noise makes most of the information along a direction, the motion does not determine it: least squares
-        attenuate it by an unknown factor. There rows count no more than what that shift would be, as a deviation,
-        allows; of the largest factor for `lost_unknown`. What was known before any row prevails. Zero where nothing is
-        determined.
+        attenuate it by an unknown factor. There the shift is zero and its size a deviation; of the largest factor for
+        `lost_unknown`, so that anything else that is known prevails. Zero where nothing is determined.
         """
-        shift, (lost_rows, uncertain) = np.zeros(determined.size), np.zeros((2, determined.size, determined.size))
+        shift, squares = np.zeros((2, determined.size)), np.zeros((2, determined.size, determined.size))
         known = np.flatnonzero(determined)
         rows = np.append(known, determined.size)
         size = np.sqrt(np.diag(self.gram)[rows])
         if known.size == 0 or not (size > 0.0).all():
-            return Correction(shift, lost_rows, uncertain)
+            return Correction(*shift, *squares)
         scale = np.outer(size, size)
-        gram, beforehand = self.gram[np.ix_(rows, rows)] / scale, self.beforehand[np.ix_(rows, rows)] / scale
-        clusters = self._clusters[:, rows[:, None], rows] / scale
+        whole_gram, clusters = self.gram[np.ix_(rows, rows)] / scale, self._clusters
+        if self.shared is not None:
+            take_off(clusters, self.multiplying, self.shared / len(clusters))
+        gram = whole_gram
+        if self.shared is not None:
+            gram, shift[0, known], squares[0][np.ix_(known, known)] = self._without_shared(whole_gram, rows, size)
+        clusters = clusters[:, rows[:, None], rows] / scale
         # A column that is noise alone may make any multiple of its square: more than some would drown the others.
         own = np.abs(np.diag(clusters.sum(axis=0)))
         limit = np.sqrt(np.divide(LARGEST_FACTOR, own, out=np.ones_like(own), where=own > LARGEST_FACTOR))
@@ -137,7 +133,7 @@ class NoiseBias(State):
         changed = clusters.sum(axis=0)
         if not changed.any():
             # Directions of exact rows may be known so differently that rounding would move them.
-            return Correction(shift, lost_rows, uncertain)
+            return Correction(*shift, *squares)
         # Directions of unit information, and the share of it that noise makes.
         values, vectors = np.linalg.eigh(gram[:-1, :-1])
         root = vectors / np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
@@ -145,12 +141,11 @@ class NoiseBias(State):
         directions = root @ axes
         along = directions.T @ gram[:-1, -1]
         lost = share >= LARGEST_SHARE
+        kept = directions[:, ~lost]
+        whole = (kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost]
         apart = np.abs(1.0 - share[lost])
         factor = np.clip(share[lost] / np.maximum(apart, 1.0 / LARGEST_FACTOR), 1.0, LARGEST_FACTOR)
         attenuated = along[lost] * (LARGEST_FACTOR if lost_unknown else factor)
-        moved, widened = _beside_lost(directions, along, lost, attenuated * size[-1], beforehand)
-        kept = directions[:, ~lost]
-        whole = (kept.T @ (gram - changed)[:-1, -1]) / (1.0 - share[~lost]) - along[~lost]
         # Each cluster's part of it, to first order.
         parts = kept.T @ (clusters[:, :-1] @ np.append(directions @ along, -1.0)).T
         count = parts.shape[1]
@@ -162,17 +157,45 @@ class NoiseBias(State):
             doubt = stdtrit(max(1, count - 1), EVIDENCE) ** 2 * np.sum(parts**2, axis=1)
             return np.asarray(1.0 - np.divide(doubt, whole**2, out=np.ones_like(doubt), where=whole**2 > doubt))
 
-        # Direction by direction: parameters that rows know together are shifted together.
         unit = size[-1] / size[:-1]
-        shift[known] = (kept @ (certain(whole, parts) * whole) + directions @ moved) * unit
+        # Direction by direction: parameters that rows know together are shifted together.
+        shift[1, known] = kept @ (certain(whole, parts) * whole) * unit
         whole, parts = kept @ whole, kept @ parts
         share = certain(whole, parts)
-        spread = np.concatenate((parts, share[:, None] * parts, np.diag((1.0 - share) * whole)), axis=1)
+        spread = np.concatenate(
+            (parts, share[:, None] * parts, np.diag((1.0 - share) * whole), directions[:, lost] * attenuated), axis=1
+        )
         spread *= unit[:, None]
-        uncertain[np.ix_(known, known)] = spread @ spread.T
-        among = directions / size[:-1, None]
-        lost_rows[np.ix_(known, known)] = among @ widened @ among.T
-        return Correction(shift, lost_rows, uncertain)
+        squares[1][np.ix_(known, known)] = spread @ spread.T
+        return Correction(*shift, *squares)
+
+    def _without_shared(self, gram: Array, rows: Indices, size: Array) -> tuple[Array, Array, Array]:
+        """Normal equations (k + 1, k + 1) of some rows and columns, scaled by their size, without what is multiplied.
+
+        And what that adds to the solution (k,) and to its covariance (k, k).
+        Along a direction that little else determines as much of it stays as its sample scatters by.
+        """
+        assert self.shared is not None
+        squares = np.zeros(len(self.gram))
+        squares[list(self.multiplying)] = self.shared
+        shared = np.diag(squares[rows] / size**2)[:-1, :-1]
+        values, vectors = np.linalg.eigh(gram[:-1, :-1])
+        root = vectors * np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
+        inverse = vectors / np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
+        share, axes = np.linalg.eigh(inverse.T @ shared @ inverse)
+        most = 1.0 - max(LEAST_LEFT, SCATTER * np.sqrt(2.0 / self.windows))
+        share = np.clip(share, 0.0, most)
+        shared = (root @ axes * share) @ (root @ axes).T
+        # Its products with the right-hand side are those with a gain of one.
+        one = np.where(squares[rows[:-1]] > 0.0, size[:-1], 0.0) / size[-1]
+        out = gram.copy()
+        out[:-1, :-1] -= shared
+        out[:-1, -1] -= shared @ one
+        out[-1, :-1] = out[:-1, -1]
+        # (A - S)⁻¹ - A⁻¹ in directions of unit information.
+        wider = (inverse @ axes * (share / (1.0 - share))) @ (inverse @ axes).T
+        moved = wider @ out[:-1, -1] + inverse @ (inverse.T @ (out[:-1, -1] - gram[:-1, -1]))
+        return out, moved * size[-1] / size[:-1], wider / np.outer(size[:-1], size[:-1])
 
     @property
     def parameters(self) -> int:
@@ -186,55 +209,38 @@ class NoiseBias(State):
         def widened(gram: Array) -> Array:
             return np.insert(np.insert(gram, at, 0.0, 0), at, 0.0, 1)
 
-        self.gram, self.beforehand, self.last = widened(self.gram), widened(self.beforehand), widened(self.last)
+        self.gram, self.last = widened(self.gram), widened(self.last)
         self.whole = [widened(cluster) for cluster in self.whole]
 
 
 class Correction(NamedTuple):
-    """What frees an estimate of the bias that noise in the columns makes.
+    """What frees an estimate of the bias that noise makes, and what that adds to its covariance.
 
-    shift (n,): to add to it. lost, uncertain (n, n): to add to its covariance, where rows say little for noise and for
-    doubt about the shift.
+    multiplied (n,), squares (n, n): for what parameters multiply, which is no information. columns (n,), uncertain
+    (n, n): for noise in the columns beside it.
     """
 
-    shift: Array
-    lost: Array
+    multiplied: Array
+    columns: Array
+    squares: Array
     uncertain: Array
 
-
-def _beside_lost(
-    directions: Array, along: Array, lost: Mask, attenuated: Array, beforehand: Array
-) -> tuple[Array, Array]:
-    """What changes where rows say little along directions: of the solution (k,) and its covariance (k, k).
-
-    directions (n, k): of unit information, with the solution `along` (k,). attenuated: how many deviations of rows
-    those that are lost to noise may be off. beforehand (n + 1, n + 1): the part of the normal equations that rows have
-    not made.
-    """
-    if not lost.any():
-        return np.zeros(along.size), np.zeros((along.size, along.size))
-    own = directions.T @ beforehand[:-1, :-1] @ directions
-    information, right = np.eye(along.size), along.copy()
-    # Rows that say nothing along a direction do not tie it to others.
-    information[lost] = own[lost]
-    information[:, lost] = own[:, lost]
-    rest = 1.0 / (1.0 + attenuated**2)
-    information[lost, lost] += rest
-    right[lost] = directions[:, lost].T @ beforehand[:-1, -1] + rest * along[lost]
-    covariance = np.linalg.inv(information)
-    return covariance @ right - along, covariance - np.eye(along.size)
+    @property
+    def shift(self) -> Array:
+        """To add to the estimate (n,)."""
+        return self.multiplied + self.columns
 
 
 def unbiased(
     estimate: Estimate, bias: NoiseBias, nuisances: Sequence[Nuisance] = (), lost_unknown: bool = False
 ) -> Estimate:
-    """A least-squares estimate free of what noise in the columns does, and of contradicted tolerances of nuisances.
+    """A least-squares estimate free of what noise does, and of contradicted tolerances of nuisances.
 
     Nuisances come first. One that was weighted against a prior keeps the bias. See `NoiseBias.correction`, `released`.
     """
     squares = estimate.covariance
     if estimate.scale is None:
         found = bias.correction(estimate.determined, lost_unknown)
-        squares = squares + found.lost
+        squares = squares + found.squares
         estimate = replace(estimate, pi=estimate.pi + found.shift, covariance=squares + found.uncertain)
     return released(estimate, nuisances, squares)

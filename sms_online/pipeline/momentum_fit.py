@@ -257,6 +257,8 @@ class MomentumFit(Stage):
         elif self._next is None and self._matters(beta, noise):
             self._next, self.state.warm = self._new_whitening(), 0
             self._next.begin(beta, noise, self.plain.misfit, window.start)
+        for whitening in self._whitenings:
+            whitening.refer(joint - np.pad(self._point(), (0, self.base.n)))
 
     def _calibrated(self, joint: Array) -> Array:
         """Nuisances and β (m + n,) that leave no more than noise, where tolerances allow that; or the same.

@@ -162,7 +162,7 @@ class Statistics:
         m = len(self.setup.nuisances)
         determined = np.concatenate((np.isfinite(estimate.nuisances_std), estimate.determined))
         assert self.momentum is not None
-        return self.momentum.bias.shift_by_columns(determined)[m:]
+        return self.momentum.bias.correction(determined).columns[m:]
 
     @one_blas_thread()
     def energy_estimate(self) -> Estimate:

@@ -327,7 +327,7 @@ class TrackerBank(Stage):
             # Noise in the columns pulls every weighted mean of the rows alike; the scatter of that grows as rows fade.
             found = bias.correction(estimate.determined)
             fewer = max(1.0, bias.windows * self._rows_a_window / estimate.rows)
-            covariance = estimate.covariance + fewer * (found.lost + found.uncertain)
+            covariance = estimate.covariance + fewer * (found.squares + found.uncertain)
             estimate = replace(estimate, pi=estimate.pi + found.shift, covariance=covariance)
         estimate = estimate.without_nuisances(self._nuisances)
         learned = tracker.found if isinstance(tracker, LearnedTrend) else ()

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sms_online.calibration.multiplied_noise import Shares
 from sms_online.pipeline.latency import LatencyColumns, SourceGroup
 from sms_online.pipeline.momentum_windows import Window
 from sms_online.pipeline.sensor_noise import SensorNoise
@@ -28,8 +29,8 @@ class WhitenedWindow:
 
     late (n_v, G): columns of the sources' latencies, likewise. calibration (n_v, m), twice: columns of what the
     description may be wrong in, as they came and likewise. multiplied (n_v, ·), twice: a sample of the noise that some
-    of these multiply. noise (n_v, n_v): covariance of the rows as they came, as far as it is noise; covariance (n_v,
-    n_v): with what the model lacks.
+    of these multiply and still hold. noise (n_v, n_v): covariance of the rows as they came, as far as it is noise;
+    covariance (n_v, n_v): with what the model lacks.
     """
 
     rows: Array
@@ -41,9 +42,14 @@ class WhitenedWindow:
 
 
 class WindowWhiteningState(State):
-    """misfit (n_v,): variance of what the model lacks in each row, over that of the noise."""
+    """What weights were begun with.
+
+    misfit (n_v,): variance of what the model lacks in each row, over that of the noise. reference (m + n,): nuisances
+    and β of the newest estimate, which residuals are of.
+    """
 
     misfit: Array
+    reference: Array
 
 
 class WindowWhitening(Stage):
@@ -55,9 +61,11 @@ class WindowWhitening(Stage):
 
     def __init__(self, noise: WindowNoise, width: int, sources: Sequence[SourceGroup] = ()) -> None:
         self.noise = noise
-        self.state = WindowWhiteningState(np.zeros(noise.n_v))
+        self.state = WindowWhiteningState(np.zeros(noise.n_v), np.zeros(noise.nuisances))
         self._late = LatencyColumns(sources)
         self._whitener = Whitener(width + len(sources) + noise.nuisances + len(noise.multiplied))
+        self._plain_shares = Shares(noise.multiplied, noise.n_v)
+        self._shares = Shares(noise.multiplied, noise.n_v)
 
     @property
     def misfit(self) -> Array:
@@ -74,9 +82,11 @@ class WindowWhitening(Stage):
 
         misfit (n_v,): variance of what the model lacks in each row, over that of the noise.
         """
-        self.state.misfit = misfit
+        self.state.misfit, self.state.reference = misfit, np.append(np.zeros(self.noise.nuisances), beta)
         self.noise.begin(beta, noise, instant)
         self._whitener.begin_segment()
+        self._plain_shares.begin()
+        self._shares.begin()
 
     def begin_segment(self) -> None:
         """The next window begins a segment, and shares no samples with those before."""
@@ -101,7 +111,22 @@ class WindowWhitening(Stage):
         rows = np.concatenate((rows, noise.calibration, noise.multiplied), axis=1)
         white = self._whitener.push(noise.covariances, rows)
         multiplied = calibrated + noise.calibration.shape[1]
-        return WhitenedWindow(
-            white[:, :width], white[:, width:calibrated], (noise.calibration, white[:, calibrated:multiplied]),
-            (noise.multiplied, white[:, multiplied:]), of_noise, own,
-        )  # fmt: skip
+        calibration = noise.calibration, white[:, calibrated:multiplied]
+        synthetic = noise.multiplied, white[:, multiplied:]
+        if len(self.noise.multiplied):
+            std = np.sqrt(np.diag(own))[:, None]
+            plain, whitened = calibration[0] / std, calibration[1]
+            residuals = self._residual(rows / std, plain), self._residual(white, whitened)
+            plain, left = self._plain_shares.taken_off(plain, synthetic[0] / std, residuals[0])
+            whitened, white_left = self._shares.taken_off(whitened, synthetic[1], residuals[1])
+            calibration, synthetic = (std * plain, whitened), (std * left, white_left)
+        return WhitenedWindow(white[:, :width], white[:, width:calibrated], calibration, synthetic, of_noise, own)
+
+    def refer(self, joint: Array) -> None:
+        """Take the newest estimate of nuisances, beside those that samples are corrected by, and of β (m + n,)."""
+        self.state.reference = joint
+
+    def _residual(self, rows: Array, N: Array) -> Array:
+        """What rows [Y b …] (n_v, ·) leave with the newest estimate."""
+        nuisances, beta = np.split(self.state.reference, [N.shape[1]])
+        return np.asarray(rows[:, beta.size] - rows[:, : beta.size] @ beta - N @ nuisances)
