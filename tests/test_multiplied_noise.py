@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sms_online as sms
-from sms_online.calibration.multiplied_noise import Multiplied, MultipliedNoise
+from sms_online.calibration.multiplied_noise import Multiplied, MultipliedNoise, Shares
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.gram_sum import GramSum
 from sms_online.pipeline.momentum_windows import STEPS
@@ -91,6 +91,36 @@ def test_synthetic_rows_have_the_covariance_of_the_noise() -> None:
         assert abs(of_sensor - covariances[-1 - hops][0, 0]) < 0.1 * size[0]
         assert abs(of_torque - covariances[-1 - hops][1, 1]) < 0.1 * size[1]
     assert not rows[:, 1, 0].any()
+
+
+@pytest.mark.parametrize("stated", [1.0, 2.0])
+def test_a_cleaned_column_does_not_correlate_with_residuals(stated: float) -> None:
+    # Noise of a torque is 0.6 of a row's variance; positions' noise, the rest, may be stated too large.
+    random = np.random.default_rng(2)
+    torque, positions = np.sqrt(0.6) * random.standard_normal(WINDOWS), random.standard_normal(WINDOWS) * np.sqrt(0.4)
+    deviation = np.sqrt(0.6 + 0.4 * stated)
+    column, residual = (10.0 + torque) / deviation, (torque + positions) / deviation
+    synthetic = np.sqrt(0.6) * random.standard_normal(WINDOWS) / deviation
+    shares = Shares([0], 1)
+    every = [
+        shares.taken_off(np.array([[a]]), np.array([[b]]), np.array([c]))
+        for a, b, c in zip(column, synthetic, residual, strict=True)
+    ]
+    cleaned = np.array([N[0, 0] for N, _ in every])
+    noise = residual - residual.mean()
+    assert noise @ (column - column.mean()) > 0.4 * WINDOWS / deviation**2
+    assert abs(noise @ (cleaned - cleaned.mean())) < 0.05 * WINDOWS / deviation**2
+    assert np.mean([left[0, 0] != 0.0 for _, left in every]) < 1e-3
+
+
+def test_a_residual_that_is_no_noise_leaves_the_column() -> None:
+    """The noise stays in it, and its sample with it, for normal equations to be freed of."""
+    shares = Shares([0], 1)
+    N, left = shares.taken_off(np.array([[3.0]]), np.array([[0.7]]), np.array([40.0]))
+    assert (N[0, 0], left[0, 0]) == (3.0, 0.7)
+    N, left = shares.taken_off(np.array([[3.0]]), np.array([[0.7]]), np.array([1.0]))
+    assert N[0, 0] < 3.0
+    assert left[0, 0] == 0.0
 
 
 def test_noise_of_a_torque_does_not_pull_its_gain() -> None:

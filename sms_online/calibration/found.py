@@ -102,7 +102,8 @@ class Calibration:
             return f"describe {self.where} with more elements"
         if self.name == "drive_gain" and self.part:
             return (
-                "measure a torque constant, or weigh one part and state it under [known]: either joint's may be wrong"
+                "check torque constants and gear ratios, or weigh one part and state it under [known]: "
+                "either joint's may be wrong"
             )
         return f"correct the system file or the sensor, or state a larger tolerances.{self.name}"
 

@@ -180,7 +180,8 @@ def gains(Q: Array, r: Array, candidates: Sequence[Array]) -> list[Gain]:
     columns = np.concatenate(candidates, axis=1)
     free = free_of(Q, columns)
     size, left = np.linalg.norm(columns, axis=0), np.linalg.norm(free, axis=0)
-    seen = left > FREE * size
+    # Squares of columns below that are none in floating point.
+    seen = left > np.maximum(FREE * size, np.sqrt(np.finfo(np.float64).tiny))
     scaled = np.divide(free, left, out=free, where=seen)
     along, start, out = scaled.T @ r, 0, []
     for each in candidates:

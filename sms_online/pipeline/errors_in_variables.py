@@ -2,7 +2,8 @@
 
 Noise enters the columns too, and products square it: the expectation of YᵀY and of Yᵀb is off in second order, which
 biases the estimate. The same noise once more, added and subtracted, changes their mean by as much again, so that
-2 YᵀY - ½ (Y₊ᵀY₊ + Y₋ᵀY₋) is free of it in second order. The first orders cancel in the pair.
+2 YᵀY - ½ (Y₊ᵀY₊ + Y₋ᵀY₋) is free of it in second order. The first orders cancel in the pair. Noise that a parameter
+multiplies is in its column and in b alike: its square is taken off both products, see `multiplied_noise`.
 Sources: Cook and Stefanski, J. American Statistical Association 89 (1994) 1314 (simulation extrapolation); Novick and
 Stefanski, ibid. 97 (2002) 472 (corrected scores by simulation). The comparison of a consistent estimate with an
 efficient one as an alarm: Hausman, Econometrica 46 (1978) 1251.
@@ -99,7 +100,8 @@ class NoiseBias(State):
     def correction(self, determined: Mask, lost_unknown: bool = False) -> Correction:
         """What to add to the least-squares estimate to free it of this bias, and to its covariance.
 
-        What parameters multiply is known, and is taken off the normal equations before all else.
+        What parameters multiply is taken off the normal equations before all else.
+
         The synthetic noise is one sample, so the shift scatters. As much of it is given as is no scatter: a bias that
         many clusters agree on counts, one that few of them make shrinks to zero as James and Stein's estimate does.
         What it shrinks by may be bias all the same, and counts as a deviation.
@@ -119,12 +121,10 @@ class NoiseBias(State):
         if known.size == 0 or not (size > 0.0).all():
             return Correction(*shift, *squares)
         scale = np.outer(size, size)
-        whole_gram, clusters = self.gram[np.ix_(rows, rows)] / scale, self._clusters
+        gram, clusters = self.gram[np.ix_(rows, rows)] / scale, self._clusters
         if self.shared is not None:
             take_off(clusters, self.multiplying, self.shared / len(clusters))
-        gram = whole_gram
-        if self.shared is not None:
-            gram, shift[0, known], squares[0][np.ix_(known, known)] = self._without_shared(whole_gram, rows, size)
+            gram, shift[0, known], squares[0][np.ix_(known, known)] = self._without_shared(gram, rows, size)
         clusters = clusters[:, rows[:, None], rows] / scale
         # A column that is noise alone may make any multiple of its square: more than some would drown the others.
         own = np.abs(np.diag(clusters.sum(axis=0)))
@@ -180,21 +180,22 @@ class NoiseBias(State):
         squares[list(self.multiplying)] = self.shared
         shared = np.diag(squares[rows] / size**2)[:-1, :-1]
         values, vectors = np.linalg.eigh(gram[:-1, :-1])
-        root = vectors * np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
-        inverse = vectors / np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
-        share, axes = np.linalg.eigh(inverse.T @ shared @ inverse)
+        length = np.sqrt(np.maximum(values, np.finfo(np.float64).eps * values[-1]))
+        share, axes = np.linalg.eigh((vectors / length).T @ shared @ (vectors / length))
         most = 1.0 - max(LEAST_LEFT, SCATTER * np.sqrt(2.0 / self.windows))
-        share = np.clip(share, 0.0, most)
-        shared = (root @ axes * share) @ (root @ axes).T
+        share = np.clip(share, 0.0, max(0.0, most))
+        # Directions of unit information, and what gives the coordinates along them.
+        directions, coordinates = vectors / length @ axes, vectors * length @ axes
+        shared = (coordinates * share) @ coordinates.T
         # Its products with the right-hand side are those with a gain of one.
         one = np.where(squares[rows[:-1]] > 0.0, size[:-1], 0.0) / size[-1]
         out = gram.copy()
         out[:-1, :-1] -= shared
         out[:-1, -1] -= shared @ one
         out[-1, :-1] = out[:-1, -1]
-        # (A - S)⁻¹ - A⁻¹ in directions of unit information.
-        wider = (inverse @ axes * (share / (1.0 - share))) @ (inverse @ axes).T
-        moved = wider @ out[:-1, -1] + inverse @ (inverse.T @ (out[:-1, -1] - gram[:-1, -1]))
+        # (A - S)⁻¹ - A⁻¹
+        wider = (directions * (share / (1.0 - share))) @ directions.T
+        moved = wider @ out[:-1, -1] + directions @ (directions.T @ (out[:-1, -1] - gram[:-1, -1]))
         return out, moved * size[-1] / size[:-1], wider / np.outer(size[:-1], size[:-1])
 
     @property

@@ -50,7 +50,7 @@ DECLARE = (
 )
 MEASURE_SLOPES = "measure slopes of the links too: the momentum balance includes the tolerances"
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
-WEIGH = "weigh one part and state it under [known], or measure a torque constant"
+WEIGH = "check torque constants and gear ratios, or weigh one part and state it under [known]"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
 LONGER = "record for longer: so few windows do not show whether it is noise of the torques or a force; else "
 OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
