@@ -41,10 +41,7 @@ class Acceptance(HeldOutRows):
         Parameters of a joint's own links follow the gain of its torque, so that rows of other joints contradict it.
         """
         acts = self._acts(k)
-        return acts | np.any(self.rows.b, axis=0) if self._is_gain(k) else acts
-
-    def _is_gain(self, k: int) -> bool:
-        return "drive_gain" in self.candidates[k].traits.calibrates
+        return acts | np.any(self.rows.b, axis=0) if self.candidates[k].is_gain else acts
 
     def improves(self, chosen: Sequence[int], candidate: int) -> bool:
         """Whether a candidate beside those chosen lowers the residual of held-out rows, and no other type's rises.
@@ -141,7 +138,7 @@ class Acceptance(HeldOutRows):
                 continue
             others = effects.copy()
             others[own] = False
-            if self._is_gain(k):
+            if self.candidates[k].is_gain:
                 others[: self.n_model] = False  # a gain scales friction of its joint as it scales its links
             if not np.all(known[own]) or np.any(np.abs(correlation[own][:, others]) > LARGEST_CORRELATION):
                 out.append(k)

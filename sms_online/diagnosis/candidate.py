@@ -11,6 +11,7 @@ from sms_online.description.schema import Effect
 from sms_online.diagnosis.evidence import Gain
 from sms_online.effects.traits import Traits
 from sms_online.model.parameters import Parameter
+from sms_online.pipeline.torque_gains import GAIN
 from sms_online.stream import Array
 
 
@@ -43,6 +44,11 @@ class Candidate:
     def key(self) -> str:
         """name@where."""
         return self.effect.key
+
+    @property
+    def is_gain(self) -> bool:
+        """Whether it is that of a torque."""
+        return GAIN in self.traits.calibrates
 
     @property
     def extends(self) -> str | None:

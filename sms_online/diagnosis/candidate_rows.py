@@ -211,7 +211,7 @@ class CandidateRows(CandidateFits):
             (k, self._N[:size, each.column], -1.0) for k, each in enumerate(multiplied) if each.column is not None
         ]
         for candidate, columns in zip(self.candidates, self._Z, strict=True):
-            if "drive_gain" in candidate.traits.calibrates:
+            if candidate.is_gain:
                 # It multiplies what acts, not what is read.
                 own = (k for k, each in enumerate(multiplied) if candidate.effect.where in each.places)
                 gained += [(k, columns[:size, 0], 1.0) for k in own]

@@ -77,7 +77,7 @@ class NoiseBias(State):
             self.whole = [one + other for one, other in zip(self.whole[::2], self.whole[1::2], strict=True)]
             self.length *= 2
         changed = 0.5 * (noisy[0].T @ noisy[0] + noisy[1].T @ noisy[1]) - gram
-        if shared is not None and self.multiplying:
+        if shared is not None and shared.any():
             squares = np.sum(shared**2, axis=0)
             take_off(changed, self.multiplying, -squares)
             self.shared = squares if self.shared is None else self.shared + squares
