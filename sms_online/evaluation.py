@@ -20,7 +20,7 @@ from sms_online.physical import PhysicalSet, Projection
 from sms_online.pipeline.description import described, nearer
 from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.tracker_bank import Reading, rows_per_second
-from sms_online.row_types import ENERGY, Residual, joint_rows, row_types
+from sms_online.row_types import ENERGY, LARGEST_RESIDUAL, Residual, joint_rows, row_types
 from sms_online.stream import Array, Mask
 from sms_online.threads import one_blas_thread
 from sms_online.tracker_results import Consistency, Drift, Tracked, TrackerResult
@@ -157,9 +157,13 @@ class Evaluation:
 
     @property
     def explains_nothing(self) -> bool:
-        """Whether the estimate leaves most of every joint's torque: it is far from any that the error bars know of."""
-        joints = [each for each in self.residuals.values() if each.relative is not None]
-        return bool(joints) and all(each.unexplained for each in joints)
+        """Whether the estimate leaves most of every joint's torque, as noise or for another reason.
+
+        Where the model lacks an effect, it is far from any that the error bars know of. Where noise is all that there
+        is, error bars rest on the noise's size alone, which is not known that well.
+        """
+        shares = [each.relative for each in self.residuals.values() if each.relative is not None]
+        return bool(shares) and min(shares) > LARGEST_RESIDUAL
 
     @cached_property
     @one_blas_thread()
@@ -240,7 +244,7 @@ class Evaluation:
         """The calibration constants that the session determines better than the description's tolerances."""
         estimate, setup = self.estimate, self.statistics.setup
         nuisances = setup.smoothed if self.statistics.method == "smoother" else setup.nuisances
-        if estimate.nuisances.size != len(nuisances) or estimate.dof <= 0.0:
+        if estimate.nuisances.size != len(nuisances) or estimate.dof <= 0.0 or not self.determined.any():
             return []
         std = max(1.0, float(np.sqrt(estimate.rss / estimate.dof))) * estimate.nuisances_std
         if self._misfit and estimate.nuisances_robust is not None:

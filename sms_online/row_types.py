@@ -31,9 +31,19 @@ class Residual(NamedTuple):
         return self.whitened is not None and self.whitened <= NOISE_WHITENED
 
     @property
+    def weak(self) -> bool:
+        """Whether a torque is noise for the most part, by its size and by what the fit leaves.
+
+        Of such a torque a fit can be so far off that it leaves more than noise, along what the motion does not show.
+        """
+        if self.relative is None or self.whitened is None or self.relative <= LARGEST_RESIDUAL:
+            return False
+        return self.noise_alone or self.relative / self.whitened > LARGEST_RESIDUAL
+
+    @property
     def unexplained(self) -> bool:
         """Whether most of a torque is unexplained, and more than noise."""
-        return self.relative is not None and self.relative > LARGEST_RESIDUAL and not self.noise_alone
+        return self.relative is not None and self.relative > LARGEST_RESIDUAL and not self.weak
 
 
 Residuals = Mapping[str, Residual]  # by type of the rows

@@ -26,22 +26,29 @@ def judge(evidence: Evidence) -> Trust:
     if reasons.lacking(evidence.discrepancies) or reasons.unexplained_torques(evidence.residual):
         # What the model lacks looks like errors of calibration as well.
         evidence = replace(evidence, miscalibrated=())
+    if _weak_throughout(evidence.residual):
+        # Nothing is known of the parameters, so nothing is known to be missing beside them.
+        evidence = replace(evidence, discrepancies=(), alarm=None)
     alarmed = _alarmed(evidence)
     wrong = _wrong(evidence, alarmed)
     # Faults of the samples come before what they may have done to the estimate.
     samples, few = sample_reasons.of_samples(evidence), sample_reasons.outliers(evidence.outliers, few=True)
+    weak = reasons.weak_torques(evidence.residual)
     if wrong:
-        return Trust("doubt", (*samples, *wrong, *few, *_cautions(evidence)), grave=True)
+        return Trust("doubt", (*samples, *wrong, *few, *weak, *_cautions(evidence)), grave=True)
     samples += few
     if never := [name for name, since in evidence.silent.items() if math.isinf(since)]:
-        return Trust("not yet", (sample_reasons.never_received(never), *samples, *_cautions(evidence)))
+        return Trust("not yet", (sample_reasons.never_received(never), *samples, *weak, *_cautions(evidence)))
     if evidence.unconverged:
         # What keeps samples from coming is to be mended before anybody moves more.
         first = [*sample_reasons.silenced(evidence.silent), *sample_reasons.troubled(evidence.troubles)]
         rest = _cautions(replace(evidence, troubles=()))
-        return Trust("not yet", (*first, reasons.unconverged(evidence.unconverged), *samples, *rest))
+        why = [reasons.unconverged(evidence.unconverged), *samples]
+        # Where nothing is determined, the weak motion is why.
+        why = [*why, *weak] if evidence.determined[0] else [*weak, *why]
+        return Trust("not yet", (*first, *why, *rest))
     # An alarm that is not grave is one that coloured noise may have caused.
-    cautions = (*samples, *alarmed, *reasons.moving(evidence.suspected), *_cautions(evidence))
+    cautions = (*samples, *weak, *alarmed, *reasons.moving(evidence.suspected), *_cautions(evidence))
     cautions = (*(cautions or reasons.inconsistent(evidence.consistency)), *reasons.unwatched(evidence.unwatched))
     return Trust("doubt", cautions) if cautions else Trust("trust", tuple(reasons.grounds(evidence)))
 
@@ -63,6 +70,12 @@ def _wrong(evidence: Evidence, alarmed: Sequence[Reason]) -> list[Reason]:
     if converged:
         out += [*reasons.negative(evidence.negative), *reasons.disputed(evidence.disputed)]
     return out
+
+
+def _weak_throughout(residual: Residuals) -> bool:
+    """Whether all torques are noise for the most part."""
+    torques = [rows for rows in residual.values() if rows.relative is not None]
+    return bool(torques) and all(rows.weak for rows in torques)
 
 
 def _alarmed(evidence: Evidence) -> list[Reason]:
@@ -97,8 +110,7 @@ def _lasting(evidence: Evidence) -> Residuals:
 
 def _cautions(evidence: Evidence) -> list[Reason]:
     """What makes some of the numbers, or their error bars, worse than they look."""
-    out = reasons.weak_torques(evidence.residual)
-    out += [each for each in evidence.miscalibrated if not each.grave]
+    out = [each for each in evidence.miscalibrated if not each.grave]
     out += [*sample_reasons.troubled(evidence.troubles), *(each for each in evidence.weaknesses if not each.grave)]
     out += noisier(evidence.noisy, evidence.residual)
     out += [replace(each, grave=False) for each in _unnamed(evidence, noisy=True)]

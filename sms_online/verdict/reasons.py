@@ -124,8 +124,7 @@ def unexplained_torques(residual: Residuals) -> list[Reason]:
 
 def weak_torques(residual: Residuals) -> list[Reason]:
     """Torques that are little more than their noise: the motion is too weak, and nothing is known to be missing."""
-    shares = {name: rows.relative for name, rows in residual.items() if rows.relative is not None}
-    weak = {name: share for name, share in shares.items() if share > LARGEST_RESIDUAL and residual[name].noise_alone}
+    weak = {name: rows.relative for name, rows in residual.items() if rows.relative is not None and rows.weak}
     if not weak:
         return []
     most = max(weak, key=lambda name: weak[name])
