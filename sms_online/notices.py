@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from sms_online.physical import Projection
 from sms_online.pipeline.statistics import Statistics
+
+if TYPE_CHECKING:
+    from sms_online.smoother.session import SmootherStatistics
 
 # Effects of one cause that a warning names.
 NAMED = 4
@@ -29,10 +34,20 @@ def smoother_warnings(now: Statistics) -> list[str]:
         return [*out, text] if missing else out
     if missing:
         out.append(f"not measured, but estimated by the equations of motion: {missing}")
-    if smoother.level > 0.0:
-        share = f"{100.0 * smoother.level:.2g} % of the usual ones"
-        out.append(f"samples do not agree with the equations of motion: unknown forces of {share} are added")
+    if allowed := _allowed(smoother):
+        out.append(f"samples do not agree with the equations of motion: {allowed}")
     return out
+
+
+def _allowed(smoother: SmootherStatistics) -> str:
+    """What a smoother had to allow for where samples do not agree with the equations of motion; empty where they do."""
+    if smoother.level > 0.0:
+        return f"unknown forces of {100.0 * smoother.level:.2g} % of the usual ones are added"
+    if smoother.torque_noise > 1.0:
+        return f"noise of the torques is taken as {smoother.torque_noise:.0f} × what they show"
+    if smoother.beyond > 1.0:
+        return f"innovations are {smoother.beyond:.2g} × their noise"
+    return ""
 
 
 def projection_warning(projection: Projection | None) -> list[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from scipy.signal import lfilter
 
 from sms_adapters.capture import CaptureWriter
 from sms_adapters.checkpoint import read_checkpoint, write_checkpoint
@@ -23,9 +24,11 @@ from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
+from sms_online.row_types import NOISE_WHITENED
 from sms_online.sensor_set import sensor_set
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Prior
+from sms_online.verdict.judged import JudgedEvaluation
 from sms_sim.plant import Plant
 from sms_sim.sensors import Sensors
 from sms_sim.simulate import Simulation, exact_states, sampled_blocks, simulate
@@ -172,15 +175,16 @@ def test_friction_that_the_model_lacks_widens_the_error_bars() -> None:
     assert lacking.smoother is not None
     assert holding.smoother is not None
     assert lacking.by_smoother
-    assert lacking.smoother.known.level > 0.0
-    assert holding.smoother.known.level == 0.0
+    assert lacking.smoother.known.beyond > NOISE_WHITENED
+    assert holding.smoother.known.beyond == 1.0
+    assert JudgedEvaluation(statistics_of(lacking), lacking.estimate()).trust.grave
     assert any(
         "do not agree with the equations" in warning for warning in results_document(lacking, 1.0, [])["warnings"]
     )
     std, wider = standard_deviation(holding)[:-1], standard_deviation(lacking)
-    assert np.all(wider > 2.0 * std)
+    assert np.all(wider > 1.5 * std)
     # Friction is no white force: damping, which is nearest to it, bends to replace it.
-    assert np.all(np.abs(lacking.estimate().pi / truth_of(lacking) - 1.0) < 0.05)
+    assert np.all(np.abs(lacking.estimate().pi / truth_of(lacking) - 1.0) < 0.01)
     assert np.all(np.abs(normalised(holding)) < 4.0)
 
 
@@ -194,6 +198,27 @@ def test_inexplicable_samples_leave_the_first_fit_and_a_warning(simulation: Simu
     assert document["method"] == "energy"
     assert any("the smoother left out 0 … 3 s" in warning for warning in document["warnings"])
     assert any("bend quasi-statically" in warning for warning in document["warnings"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.015, 0.05, 0.1])
+def test_coloured_noise_of_a_torque_is_allowed_for(simulation: Simulation, noise: float) -> None:
+    """Correlated over 50 samples, 2, 7 and 14 % of the torque: it does not show from sample to sample. Seed 0.
+
+    In 3 s that leaves parameters to a tenth, and they are not trusted.
+    """
+    block, rng = recorded(simulation, 2), np.random.default_rng(0)
+    coloured = lfilter([noise * np.sqrt(1.0 - 0.98**2)], [1.0, -0.98], rng.standard_normal(block.t.size))
+    values = block.values.copy()
+    values[:, block.channels.index("tau_1")] += coloured
+    estimator = session(one_link("linear"), Block(block.t, block.channels, values))
+    assert estimator.smoother is not None
+    known = estimator.smoother.known
+    assert not known.failures
+    assert known.level == 0.0
+    assert known.torque_noise >= 10.0
+    assert np.all(np.abs(estimator.estimate().pi / truth_of(estimator) - 1.0) < 0.15)
+    assert JudgedEvaluation(statistics_of(estimator), estimator.estimate()).trust.grave
 
 
 @pytest.mark.long

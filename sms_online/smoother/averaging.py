@@ -15,9 +15,10 @@ import numpy as np
 from sms_online.stream import Array
 from sms_online.trackers.factor import triangular_factor
 
-# So many steps in a row give a scatter, if none asks a parameter to move by more standard deviations than this.
+# So many steps in a row give a scatter, if none asks a parameter to move by more standard deviations than this; or than
+# the other where innovations hold more than noise, for dry friction, whose law is never quite true, has corners.
 FEWEST_TARGETS = 8
-LONGEST_STEP = 3.0
+LONGEST_STEP, LONGEST_MISFIT = 3.0, 20.0
 
 
 def averaged(factor: Array, targets: Sequence[Array]) -> tuple[Array, Array]:

@@ -72,31 +72,42 @@ class SpanSmoother(SmoothedReadings):
                 return Search(self, span, beta, known).through(LEVELS, (last_step,))
 
     def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
-        search = self._begun(span, beta, known)
-        fit = search.through(LEVELS[1:], STEPS)
-        if fit.level > 0.0:
-            # A start that is far off may end there too. From this one, which is near, exact equations are met if they
-            # hold.
-            with suppress(*NO_NUMBERS):
-                again = Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS)
-                return again if again.level < fit.level else fit
-        return fit
+        """From the start that leads to equations that hold, or else to those that hold best."""
+        fits, why = list[SpanFit](), "neither the balance's fit nor the description leads to the samples"
+        for search in self._begun(span, beta, known):
+            try:
+                fit = search.through(LEVELS[1:], STEPS)
+            except NO_NUMBERS as error:
+                why = str(error)
+                continue
+            fits.append(fit)
+            if fit.level > 0.0:
+                # A start that is far off may end there too. From this one, which is near, exact equations are met if
+                # they hold.
+                with suppress(*NO_NUMBERS):
+                    fits.append(Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS))
+            if fits[-1].level == 0.0:
+                return fits[-1]
+        if not fits:
+            raise DivergedError(why)
+        return min(fits, key=lambda each: each.inexact)
 
-    def _begun(self, span: Span, beta: Array, known: Array) -> Search:
-        """A search at the first level, from β (n,) or from the description, whichever leads nearer to the samples.
+    def _begun(self, span: Span, beta: Array, known: Array) -> Iterator[Search]:
+        """Searches at the first level, from β (n,) and from the description; first what leads near to the samples.
 
         From the description what loose equations do not determine is to stay near it.
         """
-        searches = []
+        later = []
         value, size = described(self.model, self.base)
         start_anew = np.concatenate((beta[: self.m], value)), np.concatenate((np.zeros(self.m), size))
         for start, reach in ((beta, None), start_anew):
-            with suppress(*NO_NUMBERS):
+            try:
                 search = Search(self, span, start, known, reach)
                 search.loosen(LEVELS[0])
-                if search.mean_square <= LARGEST_MEAN_SQUARE:
-                    return search
-                searches.append(search)
-        if not searches:
-            raise DivergedError("neither the balance's fit nor the description leads to the samples")
-        return min(searches, key=lambda search: search.mean_square)
+            except NO_NUMBERS:
+                continue
+            if search.mean_square <= LARGEST_MEAN_SQUARE:
+                yield search
+            else:
+                later.append(search)
+        yield from sorted(later, key=lambda search: search.mean_square)

@@ -17,7 +17,7 @@ from sms_online.model.dynamics import Dynamics
 from sms_online.model.model import Model
 from sms_online.model.readings import Readings
 from sms_online.physical import PhysicalSet
-from sms_online.smoother.averaging import FEWEST_TARGETS, LONGEST_STEP, averaged
+from sms_online.smoother.averaging import FEWEST_TARGETS, LONGEST_MISFIT, LONGEST_STEP, averaged
 from sms_online.smoother.collocation import defects, momenta_and_forces, transitions
 from sms_online.smoother.filter import FixedIntervalSmoother
 from sms_online.smoother.nuisances import ReadingNuisances
@@ -27,6 +27,9 @@ from sms_online.trackers.factor import Solution, solve, triangular_factor
 
 # Those that are allowed for where the samples refute exact equations; more than that is another system.
 ALLOWED = (0.001, 0.003, 0.01, 0.03)
+# Before them, times the noise that samples of the torques show: coloured noise, ripple, and friction that follows no
+# law act beside the torques, and leave the equations of all other coordinates exact.
+TORQUE_NOISE = (3.0, 10.0, 30.0, 100.0)
 # A level is tried again while the innovations are larger than noise makes them, so often at most.
 MOST_TRIES = 3
 # Time within which forces of a level change, s: white forces of share r have the density (r F)² times this. None is to
@@ -51,6 +54,9 @@ DERIVATIVES_INTERVAL = 0.04
 # Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
 # the noise behind it is estimated to a tenth.
 LARGEST_MEAN_SQUARE = 1.2
+# Mean square up to which exact equations are kept: friction that follows its law roughly leaves twice the noise. Beside
+# noise of the torques that would explain it, the scale of all parameters would be uncertain.
+LARGEST_MISFIT = 4.0
 # Directions of β with less information than this share of the best one's, in units of the columns' sizes, are left
 # as they are: derivatives are good to 1e-8.
 RANK_TOLERANCE = 1e-8
@@ -75,8 +81,8 @@ class SpanFit:
     """The information of a span at its end: a factor (n + 1, n + 1) of rows Y β = b with independent unit errors.
 
     beta (n,): estimate from this span and what was known before it. rows: how many innovations. mean_square: of the
-    whitened innovations. level: of the white forces that are left, 0 where the equations hold. step: of the
-    collocation, s. ending: last state.
+    whitened innovations. level: of the white forces that are left, 0 where the equations hold. torque_noise: times what
+    samples show of it. step: of the collocation, s. ending: last state.
     """
 
     factor: Array
@@ -84,13 +90,20 @@ class SpanFit:
     rows: int
     mean_square: float
     level: float
+    torque_noise: float
     step: float
     ending: Ending
+
+    @property
+    def inexact(self) -> tuple[float, float]:
+        """How far from exact the equations are, to compare fits by."""
+        return self.level, self.torque_noise
 
 
 class SmoothedReadings:
     """What spans of a session are fitted with: its model, the noise of its samples, and what readings may be off by.
 
+    torque_noise: times what samples show of it, of a span before.
     readings: of the samples. sigma (C,): their noise, 1σ a sample. torque (joints,): σ² T_s of n τ, (N m)² s.
     nuisances: of the session's channels, of which sensed (C,) are the readings. An estimate β (n,) holds these m
     nuisances, and then the parameters.
@@ -98,8 +111,9 @@ class SmoothedReadings:
 
     def __init__(
         self, model: Model, base: BaseParameters, readings: Readings, sigma: Array, torque: Array,
-        nuisances: ReadingNuisances, sensed: Sequence[int],
+        nuisances: ReadingNuisances, sensed: Sequence[int], torque_noise: float = 1.0,
     ) -> None:  # fmt: skip
+        self.torque_noise = torque_noise
         self.model = model
         self.base = base
         self.readings = readings
@@ -143,7 +157,7 @@ class Search:
         self.beta = beta
         self.std, self.factor = np.full(beta.size, np.inf), np.zeros((beta.size + 1, beta.size + 1))
         self.mean_square = np.inf
-        self._asked, self._relaxation = np.zeros(beta.size), 1.0
+        self._asked, self._relaxation, self._torque_noise = np.zeros(beta.size), 1.0, smoother.torque_noise
         t = span.nodes(ROUGH_STEP)
         self.motion = Motion(t, *span.guess(t))
         _, force = momenta_and_forces(smoother.dynamics(beta), self.motion.x, self.motion.v)
@@ -184,14 +198,30 @@ class Search:
                 break
             if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
                 break
-        for level in (0.0, *ALLOWED):
-            if level:
+        if self.mean_square <= LARGEST_MISFIT:
+            return self._taken(0.0, step)
+        least, near = self._torque_noise, None
+        for self._torque_noise in (times for times in TORQUE_NOISE if times > least):
+            if not np.isfinite(self.mean_square):
                 self.beta, self.motion = before
-                if not self.converge(level):
-                    continue
-            if self.mean_square <= LARGEST_MEAN_SQUARE:
-                return SpanFit(self.factor, self.beta, self.rows, self.mean_square, level, step, self.ending)
+            if self.converge(0.0) and self.mean_square <= LARGEST_MISFIT:
+                near = self._taken(0.0, step)
+                if self.mean_square <= LARGEST_MEAN_SQUARE:
+                    break
+        if near is not None:
+            return near
+        self._torque_noise = least
+        for level in ALLOWED:
+            self.beta, self.motion = before
+            if self.converge(level) and self.mean_square <= LARGEST_MEAN_SQUARE:
+                return self._taken(level, step)
         raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
+
+    def _taken(self, level: float, step: float) -> SpanFit:
+        """The fit as it is, with error bars as wide as the innovations are beyond their noise."""
+        beyond = self.mean_square if self.mean_square > LARGEST_MEAN_SQUARE else 1.0
+        factor = self.factor / np.sqrt(beyond)
+        return SpanFit(factor, self.beta, self.rows, self.mean_square, level, self._torque_noise, step, self.ending)
 
     def loosen(self, level: float) -> None:
         """Follow the samples with white forces of a level."""
@@ -212,7 +242,8 @@ class Search:
                 step = np.abs(self._asked)
                 if np.all(step <= CONVERGED * self.std):
                     return True
-                targets = [*targets, before + self._asked] if np.all(step <= LONGEST_STEP * self.std) else []
+                longest = LONGEST_STEP if self.mean_square <= LARGEST_MEAN_SQUARE else LONGEST_MISFIT
+                targets = [*targets, before + self._asked] if np.all(step <= longest * self.std) else []
         if len(targets) >= FEWEST_TARGETS:
             self.factor, self.beta = averaged(self.factor, targets[-FEWEST_TARGETS:])
             self.std = np.sqrt(np.diag(solve(triangular_factor(self._known, self.factor)).covariance()))
@@ -302,7 +333,7 @@ class Search:
 
     def _drive(self, dynamics: Dynamics, level: float, tame: bool) -> Array:
         """What unit noise adds to the state in a step, (2 n_v, noises)."""
-        noise = self._smoother.motors
+        noise = self._torque_noise * self._smoother.motors
         if level:
             forces = self._tame_forces(dynamics) if tame else np.diag(self._usual_force)
             noise = np.concatenate((noise, level * np.sqrt(CORRELATION) * forces), axis=1)

@@ -18,7 +18,7 @@ from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
 from sms_online.pipeline.synchronise import GridSamples, Synchroniser
 from sms_online.smoother.fit import SpanSmoother
 from sms_online.smoother.nuisances import ReadingNuisances
-from sms_online.smoother.search import DivergedError, SpanFit
+from sms_online.smoother.search import LARGEST_MEAN_SQUARE, DivergedError, SpanFit
 from sms_online.smoother.span import Ending, Span
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block, Indices
@@ -46,8 +46,8 @@ FINEST = 1e-6
 class SmootherStatistics(NamedTuple):
     """What the spans so far have determined; nothing in it changes as the session goes on.
 
-    failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square: of the
-    last span, see `SpanFit`; level: the largest of all. factor (m + n + 1, m + n + 1): square-root information about
+    failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square, level,
+    torque_noise: the largest of all, see `SpanFit`. factor (m + n + 1, m + n + 1): square-root information about
     beta (m + n,), nuisances and parameters; tolerances (m,): of the nuisances.
     last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque. noisier:
     channels whose samples show more noise than is stated, and how many times as much, where no fit is taken otherwise.
@@ -65,7 +65,13 @@ class SmootherStatistics(NamedTuple):
     end: float
     lost: int
     tolerances: Array
+    torque_noise: float = 1.0
     noisier: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def beyond(self) -> float:
+        """The innovations' standard deviation over that of their noise, of the worst span; 1 where that is noise."""
+        return float(np.sqrt(self.mean_square)) if self.mean_square > LARGEST_MEAN_SQUARE else 1.0
 
     def beforehand(self, prior: Prior | None) -> Array:
         """What is known of nuisances and parameters beforehand, as rows (·, m + n + 1)."""
@@ -241,7 +247,8 @@ class Smoother(Stage):
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
         noise = sigma[sensed], torque_density
-        smoother = SpanSmoother(self._model, self._base, readings, *noise, self._readings, sensed.tolist())
+        of_channels = self._readings, sensed.tolist()
+        smoother = SpanSmoother(self._model, self._base, readings, *noise, *of_channels, self.known.torque_noise)
         try:
             if not moved.any():
                 raise DivergedError("the sensors give no motion to begin with")
@@ -252,6 +259,10 @@ class Smoother(Stage):
             beta = past.beta if past.spans else np.concatenate((first, self._realisable(first_fit())))
             known = triangular_factor(past.beforehand(self.prior), past.factor)
             fit = smoother.fit(span, beta, known, past.last_step if past.spans else None, now.ending)
+            doubtful = fit.mean_square > LARGEST_MEAN_SQUARE or fit.torque_noise > past.torque_noise
+            if doubtful and self._noisier(now.t[inside], now.values[inside]):
+                self._fit(count, first_fit)
+                return
         except DivergedError as error:
             if self._noisier(now.t[inside], now.values[inside]):
                 self._fit(count, first_fit)
@@ -304,7 +315,7 @@ class Smoother(Stage):
             failures=past.failures,
             spans=past.spans + 1,
             level=float(np.fmax(past.level, fit.level)),
-            mean_square=fit.mean_square,
+            mean_square=float(np.fmax(past.mean_square, fit.mean_square)),
             factor=triangular_factor(past.factor, fit.factor),
             beta=fit.beta,
             rows=past.rows + fit.rows,
@@ -313,6 +324,7 @@ class Smoother(Stage):
             end=end,
             lost=self._synchroniser.counters.lost_samples,
             tolerances=past.tolerances,
+            torque_noise=max(past.torque_noise, fit.torque_noise),
             noisier=past.noisier,
         )
 

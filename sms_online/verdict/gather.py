@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,14 +13,20 @@ from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.sensing import is_slow
 from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.synchronise import SIDE
+from sms_online.row_types import NOISE_WHITENED
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
 from sms_online.verdict.reasons import DECLARE, MEASURE_SLOPES, unexplained_torques
 from sms_online.verdict.torque_noise import noisy_torques
 from sms_online.verdict.trust import Reason
 
+if TYPE_CHECKING:
+    from sms_online.smoother.session import SmootherStatistics
+
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
+# Unexplained forces beside torques, times their noise, beyond which parameters are off by more than error bars say.
+LARGEST_TORQUE_NOISE = 3.0
 # Tolerances that are none of the smoother's readings.
 NOT_SMOOTHED = ("length", "axis", "gravity", "gauge_low_pass", "base_angle", "truncation", "drive_gain", "drive_offset")
 
@@ -122,9 +129,8 @@ def _weaknesses(now: Statistics) -> list[Reason]:
     """What weakens an estimate by the way it is made."""
     out: list[Reason] = []
     by_smoother = now.method == "smoother"
-    if now.smoother is not None and now.smoother.level > 0.0 and by_smoother:
-        # What acts there is no white force, and shifts parameters by more than white ones of its size would.
-        out.append(Reason("samples do not agree with the equations of motion", True, then=DECLARE))
+    if now.smoother is not None and by_smoother:
+        out += _inexact(now.smoother)
     tolerances = now.setup.system.tolerances.model_dump()
     if by_smoother and any(tolerances[name] != 0.0 for name in NOT_SMOOTHED):
         text = "the smoother's error bars do not include the tolerances of lengths, axes, gravity and drives"
@@ -138,3 +144,16 @@ def _weaknesses(now: Statistics) -> list[Reason]:
         whose = late.source if late.size > 0.0 else f"all sources but {late.source}"
         out.append(Reason(f"{whose}: {1e3 * abs(late.size):.2g} ms later than stated", False))
     return out
+
+
+def _inexact(smoother: SmootherStatistics) -> list[Reason]:
+    """What the smoother had to allow for. Nothing that acts there is white: it shifts parameters by more than that."""
+    if smoother.level > 0.0:
+        return [Reason("samples do not agree with the equations of motion", True, then=DECLARE)]
+    if smoother.torque_noise > 1.0:
+        text = f"what acts beside the torques is {smoother.torque_noise:.0f} × their noise"
+        return [Reason(text, smoother.torque_noise > LARGEST_TORQUE_NOISE, then=DECLARE)]
+    if smoother.beyond == 1.0:
+        return []
+    text = f"innovations are {smoother.beyond:.2g} × their noise: forces on the joints do not quite follow their laws"
+    return [Reason(text, smoother.beyond > NOISE_WHITENED, then=DECLARE)]
