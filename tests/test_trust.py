@@ -12,7 +12,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.row_types import Residual
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
-from sms_online.verdict.reasons import CHECK_ROWS, MOVE, place_of
+from sms_online.verdict.reasons import CHECK_ROWS, DECLARE, MOVE, place_of
 from sms_online.verdict.trust import LONGEST_SENTENCE, Reason
 from tests.axis import AXIS, axis_block
 from tests.evaluated import judged, results_document
@@ -116,6 +116,26 @@ def test_what_harms_some_numbers_is_a_doubt_that_is_not_grave(evidence: Evidence
 )
 def test_what_is_explained_or_harmless_leaves_trust(evidence: Evidence) -> None:
     assert judge(evidence).level == "trust"
+
+
+def test_nothing_is_missing_beside_torques_that_are_noise() -> None:
+    """Of a torque that is noise for the most part a fit may leave twice the noise, along what no motion shows."""
+    weak = replace(GOOD, residual={"joint_1": Residual(1.7, 1.8)}, discrepancies=(LACKING,), alarm="joint_1")
+    judgement = judge(weak)
+    assert (judgement.level, judgement.grave) == ("doubt", False)
+    assert judgement.sentence == "Doubt: weak data: 100 % of the torque or force of joint_1 is noise"
+    assert judgement.next_step == MOVE
+    undetermined = judge(replace(weak, determined=(0, 16), unconverged="no parameter is determined"))
+    assert undetermined.sentence == "Not yet: weak data: 100 % of the torque or force of joint_1 is noise"
+    wrong = judge(replace(weak, residual={"joint_1": Residual(1.7, 9.0)}))
+    assert wrong.grave
+
+
+def test_no_diagnosis_is_asked_for_where_there_are_no_rows() -> None:
+    wrong = with_row("joint_1", relative=0.9, whitened=9.0)
+    assert "sms-online diagnose" in judge(wrong).next_step
+    smoothed = judge(replace(wrong, smoothed=True))
+    assert smoothed.next_step == f"check sign, unit and gear ratio of that torque; else {DECLARE}"
 
 
 def test_the_named_effect_comes_before_its_residual() -> None:

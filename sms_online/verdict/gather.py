@@ -63,6 +63,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         still=any(each.still for each in now.setup.system.trackers[:1]),
         unwatched=now.duration if now.method == "momentum" and momentum is not None and momentum.unwatched else 0.0,
         consistency=trackers[0].consistency if trackers else None,
+        smoothed=now.method == "smoother",
         scale=now.setup.system.scale_tolerance,
     )
 

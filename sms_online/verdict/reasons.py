@@ -146,6 +146,14 @@ def beyond_limit(residual: Residuals) -> list[Reason]:
     return [Reason(f"the residual of {worst} is {mark}", True, (worst,), mark, full, CHECK_ROWS)]
 
 
+def without_diagnosis(reason: Reason) -> Reason:
+    """The same with what to do where there are no rows to diagnose."""
+    if "sms-online diagnose" not in reason.then or DECLARE in reason.then:
+        return reason
+    checked = reason.then.removesuffix(THEN_DIAGNOSE)
+    return replace(reason, then=DECLARE if checked == reason.then else f"{checked}; else {DECLARE}")
+
+
 def or_short(found: Sequence[Reason], residual: Residuals) -> list[Reason]:
     """The same of a session too short to show whether it is noise, where all torques are nearly explained."""
     if any(rows.relative is not None and rows.relative > NOISE_RESIDUAL for rows in residual.values()):
