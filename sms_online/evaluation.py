@@ -93,9 +93,10 @@ class Evaluation:
         """1σ of each parameter (n,) as it is reported, inf where the data determine nothing.
 
         The smoother's covariance follows from the noise of sensors and torques, and of forces where it had to allow
-        some. Rows of the momentum balance have a predicted variance. While the residual agrees with it, the estimate's
-        covariance follows from it; where rows leave more, the model lacks something and the residual decides, as it
-        does for rows of the energy balance.
+        some; then it is no smaller than what blocks of spans scatter by, see `smoother.jackknife`. Rows of the momentum
+        balance have a predicted variance. While the residual agrees with it, the estimate's covariance follows from it;
+        where rows leave more, the model lacks something and the residual decides, as it does for rows of the energy
+        balance.
         From the residual: the larger of two answers. One takes the rows' errors as independent with the residual's
         variance, the other allows errors that last within clusters of rows. To it comes what errors add that rows of an
         energy window share, which least squares absorbs and no residual shows; it is known while no row is forgotten.
@@ -117,6 +118,8 @@ class Evaluation:
         misfit = self._misfit
         if now.method == "smoother" or (estimate.scale is not None and not misfit):
             std[known] = estimate.std[known]
+            if now.method == "smoother" and estimate.covariance_robust is not None:
+                std[known] = np.maximum(std, np.sqrt(np.diag(estimate.covariance_robust)))[known]
             return std
         row_variance = estimate.rss / estimate.dof
         if now.method == "momentum" and row_variance <= LARGEST_ROW_VARIANCE and not misfit:
@@ -247,7 +250,7 @@ class Evaluation:
         if estimate.nuisances.size != len(nuisances) or estimate.dof <= 0.0 or not self.determined.any():
             return []
         std = max(1.0, float(np.sqrt(estimate.rss / estimate.dof))) * estimate.nuisances_std
-        if self._misfit and estimate.nuisances_robust is not None:
+        if (self._misfit or self.statistics.method == "smoother") and estimate.nuisances_robust is not None:
             std = np.maximum(std, estimate.nuisances_robust)
         return found(nuisances, estimate.nuisances, std)
 

@@ -17,6 +17,7 @@ from sms_online.pipeline.sensing import Sensing, stated_noise
 from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
 from sms_online.pipeline.synchronise import GridSamples, Synchroniser
 from sms_online.smoother.fit import SpanSmoother
+from sms_online.smoother.jackknife import SpanBlock, jackknife_covariance, with_span
 from sms_online.smoother.nuisances import ReadingNuisances
 from sms_online.smoother.search import LARGEST_MEAN_SQUARE, DivergedError, SpanFit
 from sms_online.smoother.span import Ending, Span
@@ -51,6 +52,7 @@ class SmootherStatistics(NamedTuple):
     beta (m + n,), nuisances and parameters; tolerances (m,): of the nuisances.
     last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque. noisier:
     channels whose samples show more noise than is stated, and how many times as much, where no fit is taken otherwise.
+    blocks: of spans, in order of time.
     """
 
     failures: tuple[str, ...]
@@ -67,6 +69,12 @@ class SmootherStatistics(NamedTuple):
     tolerances: Array
     torque_noise: float = 1.0
     noisier: tuple[tuple[str, float], ...] = ()
+    blocks: tuple[SpanBlock, ...] = ()
+
+    @property
+    def exact(self) -> bool:
+        """Whether samples agree with the equations of motion, and nothing had to be allowed for."""
+        return self.beyond == 1.0 and self.torque_noise == 1.0 and self.level == 0.0
 
     @property
     def beyond(self) -> float:
@@ -90,7 +98,7 @@ class SmootherStatistics(NamedTuple):
         estimate = Estimate(
             pi=self.beta.copy(),
             covariance=solution.covariance(),
-            covariance_robust=None,
+            covariance_robust=None if self.exact else jackknife_covariance(self.blocks, self.beforehand(prior)),
             determined=solution.determined,
             condition_number=solution.condition_number,
             rows=float(self.rows),
@@ -326,6 +334,7 @@ class Smoother(Stage):
             tolerances=past.tolerances,
             torque_noise=max(past.torque_noise, fit.torque_noise),
             noisier=past.noisier,
+            blocks=with_span(past.blocks, fit.rows, fit.factor),
         )
 
     def _noisier(self, t: Array, values: Array) -> bool:
