@@ -34,6 +34,8 @@ LEVELS = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 LATER_LEVELS = (0.01, 0.001, 0.0)
 # And that of a span whose first state is known, too.
 NEXT_LEVELS = (0.0,)
+# Level, and times the torques' noise, up to which no other start is tried: what a poor one leaves is far more.
+NEARLY_EXACT = (0.0, 3.0)
 # Steps of the collocation, s, ever finer.
 STEPS = (0.005, 0.0025, 0.00125)
 
@@ -86,7 +88,7 @@ class SpanSmoother(SmoothedReadings):
                 # they hold.
                 with suppress(*NO_NUMBERS):
                     fits.append(Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS))
-            if fits[-1].level == 0.0:
+            if fits[-1].inexact <= NEARLY_EXACT:
                 return fits[-1]
         if not fits:
             raise DivergedError(why)
