@@ -52,7 +52,8 @@ class SmootherStatistics(NamedTuple):
     beta (m + n,), nuisances and parameters; tolerances (m,): of the nuisances.
     last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque. noisier:
     channels whose samples show more noise than is stated, and how many times as much, where no fit is taken otherwise.
-    blocks: of spans, in order of time.
+    blocks: of spans, in order of time. scatter (m + n, m + n): covariance of β by what these scatter by, where samples
+    do not agree with the equations and there are blocks enough.
     """
 
     failures: tuple[str, ...]
@@ -70,6 +71,7 @@ class SmootherStatistics(NamedTuple):
     torque_noise: float = 1.0
     noisier: tuple[tuple[str, float], ...] = ()
     blocks: tuple[SpanBlock, ...] = ()
+    scatter: Array | None = None
 
     @property
     def exact(self) -> bool:
@@ -98,7 +100,7 @@ class SmootherStatistics(NamedTuple):
         estimate = Estimate(
             pi=self.beta.copy(),
             covariance=solution.covariance(),
-            covariance_robust=None if self.exact else jackknife_covariance(self.blocks, self.beforehand(prior)),
+            covariance_robust=self.scatter,
             determined=solution.determined,
             condition_number=solution.condition_number,
             rows=float(self.rows),
@@ -246,40 +248,50 @@ class Smoother(Stage):
         now.moved, now.motion = now.moved[kept], now.motion[kept]
 
     def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> None:
+        """Fit a span; once more where it does not agree with its samples, and these show more noise than is stated."""
         now = self.state
-        torque_t = self._time(now.index[:count, 0])
-        begin, end = torque_t[0], torque_t[-1]
+        begin, end = self._time(now.index[[0, count - 1], 0])
         inside = (now.t >= begin) & (now.t <= end)
+        t, values = now.t[inside], now.values[inside]
+        fit = self._fitted(count, t, values, first_fit)
+        if self._doubtful(fit) and self._noisier(t, values):
+            fit = self._fitted(count, t, values, first_fit)
+        if isinstance(fit, SpanFit):
+            now.ending = fit.ending
+            self._take(fit, end)
+        else:
+            failures = (*now.known.failures, f"{begin:.6g} … {end:.6g} s: {fit}")
+            now.known, now.ending = now.known._replace(failures=failures), None
+
+    def _doubtful(self, fit: SpanFit | DivergedError) -> bool:
+        if isinstance(fit, DivergedError):
+            return True
+        return fit.mean_square > LARGEST_MEAN_SQUARE or fit.torque_noise > self.known.torque_noise
+
+    def _fitted(
+        self, count: int, t: Array, values: Array, first_fit: Callable[[], Estimate]
+    ) -> SpanFit | DivergedError:
+        """Fit of the first `count` torques and of readings (M, channels) at t (M,), s; or why there is none."""
+        now, past = self.state, self.known
+        torque_t = self._time(now.index[:count, 0])
         moved = (now.moved >= now.index[0, 0]) & (now.moved <= now.index[count - 1, 0])
-        values, sigma, torque_density = self._with_noise(now.t[inside], now.values[inside], now.torque[:count])
+        sigma, torque_density = self._noise(t, values, now.torque[:count])
         sensed = np.flatnonzero(np.isfinite(sigma))
         readings = Readings(self._model, [self.channels[k] for k in sensed])
         noise = sigma[sensed], torque_density
         of_channels = self._readings, sensed.tolist()
-        smoother = SpanSmoother(self._model, self._base, readings, *noise, *of_channels, self.known.torque_noise)
+        smoother = SpanSmoother(self._model, self._base, readings, *noise, *of_channels, past.torque_noise)
+        if not moved.any():
+            return DivergedError("the sensors give no motion to begin with")
+        guess = self._guess(self._time(now.moved[moved]), now.motion[moved], t, values)
+        span = Span(torque_t, now.torque[:count], t, values[:, sensed], *guess)
+        known = triangular_factor(past.beforehand(self.prior), past.factor)
         try:
-            if not moved.any():
-                raise DivergedError("the sensors give no motion to begin with")
-            guess = self._guess(self._time(now.moved[moved]), now.motion[moved], now.t[inside], values)
-            span = Span(torque_t, now.torque[:count], now.t[inside], values[:, sensed], *guess)
-            past = now.known
             first = np.zeros(len(self.nuisances))
             beta = past.beta if past.spans else np.concatenate((first, self._realisable(first_fit())))
-            known = triangular_factor(past.beforehand(self.prior), past.factor)
-            fit = smoother.fit(span, beta, known, past.last_step if past.spans else None, now.ending)
-            doubtful = fit.mean_square > LARGEST_MEAN_SQUARE or fit.torque_noise > past.torque_noise
-            if doubtful and self._noisier(now.t[inside], now.values[inside]):
-                self._fit(count, first_fit)
-                return
+            return smoother.fit(span, beta, known, past.last_step if past.spans else None, now.ending)
         except DivergedError as error:
-            if self._noisier(now.t[inside], now.values[inside]):
-                self._fit(count, first_fit)
-                return
-            failures = (*now.known.failures, f"{begin:.6g} … {end:.6g} s: {error}")
-            now.known, now.ending = now.known._replace(failures=failures), None
-            return
-        now.ending = fit.ending
-        self._take(fit, end)
+            return error
 
     def _guess(self, t: Array, motion: Array, sampled: Array, values: Array) -> tuple[Array, Array, Array]:
         """Instants, x and v of a motion with gaps, filled from those sensors that read something.
@@ -319,7 +331,7 @@ class Smoother(Stage):
 
     def _take(self, fit: SpanFit, end: float) -> None:
         past = self.state.known
-        self.state.known = SmootherStatistics(
+        known = SmootherStatistics(
             failures=past.failures,
             spans=past.spans + 1,
             level=float(np.fmax(past.level, fit.level)),
@@ -336,6 +348,9 @@ class Smoother(Stage):
             noisier=past.noisier,
             blocks=with_span(past.blocks, fit.rows, fit.factor),
         )
+        # Here, as it takes a solution for each block, and estimates are asked for more often than spans end.
+        scatter = None if known.exact else jackknife_covariance(known.blocks, known.beforehand(self.prior))
+        self.state.known = known._replace(scatter=scatter)
 
     def _noisier(self, t: Array, values: Array) -> bool:
         """Whether samples (M, channels) at t (M,) show more noise than is taken so far; then that is taken."""
@@ -359,8 +374,8 @@ class Smoother(Stage):
         except ArithmeticError as error:
             raise DivergedError(str(error)) from None
 
-    def _with_noise(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array, Array]:
-        """Samples at t, their noise (C,), NaN where nothing is known of it, and the torques' density (joints,)."""
+    def _noise(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array]:
+        """Noise of samples at t (channels,), NaN where nothing is known of it, and the torques' density (joints,)."""
         times = dict(self.known.noisier)
         sigma = stated_noise(self._model.system, self.channels) * [times.get(name, 1.0) for name in self.channels]
         if self.state.ending is not None:
@@ -378,7 +393,7 @@ class Smoother(Stage):
         drives[silent] = noise_std(torque[-SAMPLES:, silent])
         drives = np.maximum(drives, FINEST * np.abs(torque).max(axis=0) + np.finfo(np.float64).tiny)
         periods = np.fmax(self._synchroniser.periods, 1.0 / self._rate)
-        return values, sigma, drives**2 * periods
+        return sigma, drives**2 * periods
 
     def estimate(self) -> Estimate:
         """The base parameters as known now, with the prior; only after the first span."""
