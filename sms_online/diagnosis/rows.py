@@ -200,10 +200,10 @@ class SessionRows(WeakRows):
 
     def _second_order(self) -> SecondOrderNoise:
         """Second-order noise as in the fit."""
-        samples = [beyond_first_order(part.copies, self.beta) for part in self._parts if part.windows]
-        squares = np.concatenate(samples) ** 2
-        widths = self.weak.windows.half_width
-        return SecondOrderNoise({M: squares[widths == M].mean(axis=0) for M in np.unique(widths).tolist()})
+        parts = [part for part in self._parts if part.windows]
+        samples = np.concatenate([beyond_first_order(part.copies, self.beta) for part in parts])
+        rest = np.array([window.rest for part in parts for window in part.windows])
+        return SecondOrderNoise.of(samples, ~self._balance.rough.resting(rest), self.weak.windows.half_width)
 
     @staticmethod
     def _extend(noise: WindowNoise, instants: list[Instants]) -> None:

@@ -328,7 +328,9 @@ class MomentumFit(Stage):
         assert sensors is not None
         samples = beyond_first_order(rows, weights)
         widths = [window.half_width for window in windows]
-        errors = self._errors.push(widths, samples, size(rows[:, 0], weights))
+        resting = self._balance.rough.resting(np.array([window.rest for window in windows]))
+        moving, whole = self._errors.push(widths, samples, resting, size(rows[:, 0], weights))
+        errors = whole if misfit.any() else moving
         columns = np.concatenate((rows.swapaxes(1, 2).reshape(W, n_v, -1), ramp, bend), axis=2)
         whitened = self._whiten(windows, columns, errors)
         raw, noisy = rows[:, 0], 0.5 * (rows[:, 1] - rows[:, 2])
@@ -353,7 +355,9 @@ class MomentumFit(Stage):
         raw, white = np.ascontiguousarray(raw), np.ascontiguousarray(white)
         out = []
         for k, (window, each) in enumerate(zip(windows, whitened, strict=True)):
-            self.plain.add(raw[k], noisy[k], np.diag(each.noise), weights, each.multiplied[0])
+            # Whether rows hold more than noise is asked of all alike, or the answer would change what is asked.
+            variance = np.diag(each.noise) + whole[k] - errors[k]
+            self.plain.add(raw[k], noisy[k], variance, weights, each.multiplied[0])
             unsteady = np.diag(UNSTEADY * samples[k] ** 2)
             covariance, noise = each.covariance + unsteady, each.noise + unsteady
             out.append(

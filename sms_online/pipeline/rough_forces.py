@@ -125,7 +125,15 @@ class RoughForces:
         by_axis = np.eye(self._model.layout.n_v)[self.axes]
         if not self.dry.size:
             return np.empty((len(rest), 0, by_axis.shape[1]))
-        return np.asarray(np.abs((rest * pi[self.dry]) @ by_axis))
+        # A negative breakaway is an estimate that went astray; what it would hide is what leads back.
+        return np.asarray(np.maximum((rest * pi[self.dry]) @ by_axis, 0.0))
+
+    def resting(self, rest: Array) -> Mask:
+        """Rows (W, n_v) in which an axis of dry friction rests or turns back. rest (W, INSTANTS, D): `stiction_std`."""
+        out = np.zeros((len(rest), self._model.layout.n_v), dtype=np.bool_)
+        for k, axis in enumerate(self.axes):
+            out[:, axis] |= rest[..., k].any(axis=1)
+        return out
 
     def without(self, pi: Array) -> Array:
         """π (n_pi,) without the forces that `slopes` covers."""

@@ -1,4 +1,9 @@
-"""Second-order noise of rows, which nothing propagates: estimated from rows of noisy copies of the samples."""
+"""Second-order noise of rows, which nothing propagates: estimated from rows of noisy copies of the samples.
+
+Where an axis of dry friction rests or turns back, noise makes the sign of the friction. What that does to a row is
+within the variance of stiction there, and is no noise of the rows in which the axis moves. Where rows hold more than
+noise, it is counted in all of them: friction that turns back is what a law describes worst.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ import numpy as np
 
 from sms_online.pipeline.smoothing import HALF_WIDTHS
 from sms_online.state import Stage, State
-from sms_online.stream import Array
+from sms_online.stream import Array, Indices, Mask
 
 # Windows of one filter's width over which the square of such a sample is averaged. The samples of windows that overlap
 # are nearly one, so a mean over few of them follows its own luck: rows in which it is low would be trusted too much.
@@ -46,6 +51,15 @@ class SecondOrderNoise(State):
 
     means: dict[int, Array]
 
+    @staticmethod
+    def of(samples: Array, taken: Mask, half_widths: Indices) -> SecondOrderNoise:
+        """Of samples (W, n_v) of windows, those that are taken (W, n_v); half_widths (W,): of the windows' filters."""
+        means = {}
+        for M in np.unique(half_widths).tolist():
+            own, count = taken[half_widths == M], np.sum(taken[half_widths == M], axis=0)
+            means[M] = np.sum(own * samples[half_widths == M] ** 2, axis=0) / np.maximum(count, 1)
+        return SecondOrderNoise(means)
+
     def variance(self, half_width: int) -> Array:
         """(n_v,) for one half width; a width without samples counts as the nearest one that has some.
 
@@ -55,14 +69,38 @@ class SecondOrderNoise(State):
         return np.asarray(np.max([mean for M, mean in self.means.items() if least <= M], axis=0))
 
 
+class SampledNoise(State):
+    """Second-order noise of windows so far; sampled, M to (n_v,): how many there are behind each mean, at most."""
+
+    noise: SecondOrderNoise
+    sampled: dict[int, Array]
+
+    @staticmethod
+    def none(n_v: int) -> SampledNoise:
+        """Of no windows."""
+        return SampledNoise(SecondOrderNoise(dict.fromkeys(HALF_WIDTHS, np.zeros(n_v))), {})
+
+    def begin(self) -> None:
+        """The same windows come once more: until a width comes again its mean counts."""
+        self.sampled = {}
+
+    def add(self, half_width: int, sample: Array, taken: Mask) -> None:
+        """Take a window's samples (n_v,), those that are `taken` (n_v,)."""
+        means, count = self.noise.means, self.sampled.get(half_width, np.zeros(sample.size))
+        count = self.sampled[half_width] = np.minimum(count + taken, MOST_SAMPLES)
+        change = taken * (sample**2 - means[half_width]) / np.maximum(count, 1.0)
+        means[half_width] = means[half_width] + change
+
+
 class RowErrorsState(State):
     """What is known of errors of rows so far.
 
-    sampled: windows behind the mean squares, by the filter's half width. largest (n_v,): largest sum of a row's terms.
+    moving: of rows in which no axis of dry friction rests or turns back; whole: of all. largest (n_v,): largest sum of
+    a row's terms.
     """
 
-    second_order: SecondOrderNoise
-    sampled: dict[int, int]
+    moving: SampledNoise
+    whole: SampledNoise
     largest: Array
 
 
@@ -70,26 +108,25 @@ class RowErrors(Stage):
     """Variance of the rows of a session's windows by what noise does beyond first order, and by numerics."""
 
     def __init__(self, n_v: int) -> None:
-        none = np.zeros(n_v)
-        means = SecondOrderNoise(dict.fromkeys(HALF_WIDTHS, none))
-        self.state = RowErrorsState(means, dict.fromkeys(HALF_WIDTHS, 0), none)
+        self.state = RowErrorsState(SampledNoise.none(n_v), SampledNoise.none(n_v), np.zeros(n_v))
 
     def begin(self) -> None:
-        """The same windows come once more, with other weights: until a width comes again its mean counts."""
-        self.state.sampled = dict.fromkeys(HALF_WIDTHS, 0)
+        """The same windows come once more, with other weights."""
+        self.state.moving.begin()
+        self.state.whole.begin()
         # A fit that failed may have made terms larger than those of any row are.
         self.state.largest = np.zeros_like(self.state.largest)
 
-    def push(self, half_widths: Sequence[int], samples: Array, sizes: Array) -> Array:
-        """(W, n_v) of the next windows, by their filter's half widths.
+    def push(self, half_widths: Sequence[int], samples: Array, resting: Mask, sizes: Array) -> tuple[Array, Array]:
+        """Twice (W, n_v) of the next windows, by their filter's half widths: of moving axes, and of all rows alike.
 
-        samples (W, n_v): of what is beyond first order. sizes (W, n_v): sums of the rows' terms.
+        samples (W, n_v): of what is beyond first order. resting (W, n_v): see `RoughForces.resting`. sizes (W, n_v):
+        sums of the rows' terms.
         """
-        now, out = self.state, np.empty_like(samples)
-        means = now.second_order.means
-        for own, M, sample, terms in zip(out, half_widths, samples, sizes, strict=True):
-            now.sampled[M] = min(now.sampled[M] + 1, MOST_SAMPLES)
-            means[M] = means[M] + (sample**2 - means[M]) / now.sampled[M]
-            now.largest = np.maximum(now.largest, terms)
-            own[:] = now.second_order.variance(M) + numerical(now.largest)
-        return out
+        now, out, every = self.state, np.empty((2, *samples.shape)), np.ones(samples.shape[1], dtype=np.bool_)
+        for k, M in enumerate(half_widths):
+            now.largest = np.maximum(now.largest, sizes[k])
+            for means, taken, own in ((now.moving, ~resting[k], out[0]), (now.whole, every, out[1])):
+                means.add(M, samples[k], taken)
+                own[k] = means.noise.variance(M) + numerical(now.largest)
+        return out[0], out[1]
