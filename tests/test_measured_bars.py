@@ -132,7 +132,6 @@ def test_a_prior_determines_no_axis_of_a_robot() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="no parameter is three deviations from zero in both halves of five seconds")
 def test_halves_of_a_robot_run_agree_within_their_bars() -> None:
     """Without a prior, from the rows alone: few parameters are determined in five seconds, friction of two axes."""
     system = load_system(str(measured(KUKA / "system.toml")))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sms_online as sms
-from sms_online.calibration.multiplied_noise import Multiplied, MultipliedNoise, Shares
+from sms_online.calibration.multiplied_noise import SAMPLES, Multiplied, MultipliedNoise, Shares
 from sms_online.pipeline.errors_in_variables import NoiseBias
 from sms_online.pipeline.gram_sum import GramSum
 from sms_online.pipeline.momentum_windows import STEPS
@@ -100,10 +100,10 @@ def test_a_cleaned_column_does_not_correlate_with_residuals(stated: float) -> No
     torque, positions = np.sqrt(0.6) * random.standard_normal(WINDOWS), random.standard_normal(WINDOWS) * np.sqrt(0.4)
     deviation = np.sqrt(0.6 + 0.4 * stated)
     column, residual = (10.0 + torque) / deviation, (torque + positions) / deviation
-    synthetic = np.sqrt(0.6) * random.standard_normal(WINDOWS) / deviation
+    synthetic = np.sqrt(0.6) * random.standard_normal((WINDOWS, SAMPLES)) / deviation
     shares = Shares([0], 1)
     every = [
-        shares.taken_off(np.array([[a]]), np.array([[b]]), np.array([c]))
+        shares.taken_off(np.array([[a]]), b[None, None], np.array([c]))
         for a, b, c in zip(column, synthetic, residual, strict=True)
     ]
     cleaned = np.array([N[0, 0] for N, _ in every])
@@ -116,9 +116,9 @@ def test_a_cleaned_column_does_not_correlate_with_residuals(stated: float) -> No
 def test_a_residual_that_is_no_noise_leaves_the_column() -> None:
     """The noise stays in it, and its sample with it, for normal equations to be freed of."""
     shares = Shares([0], 1)
-    N, left = shares.taken_off(np.array([[3.0]]), np.array([[0.7]]), np.array([40.0]))
+    N, left = shares.taken_off(np.array([[3.0]]), np.full((1, 1, SAMPLES), 0.7), np.array([40.0]))
     assert (N[0, 0], left[0, 0]) == (3.0, 0.7)
-    N, left = shares.taken_off(np.array([[3.0]]), np.array([[0.7]]), np.array([1.0]))
+    N, left = shares.taken_off(np.array([[3.0]]), np.full((1, 1, SAMPLES), 0.7), np.array([1.0]))
     assert N[0, 0] < 3.0
     assert left[0, 0] == 0.0
 

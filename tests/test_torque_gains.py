@@ -120,7 +120,8 @@ def test_what_cannot_fix_the_scale_changes_no_estimate(arm: System) -> None:
     assert weighed.document()["scale_tolerance"] == free.document()["scale_tolerance"] == 0.01
     assert any("does not fix the scale" in warning for warning in weighed.warnings)
     for name in ("motor_2.rotor_inertia", "link_2.inertia", "link_2.first_moment_x"):
-        assert weighed.parameters[name].value == pytest.approx(free.parameters[name].value, rel=1e-3)
+        of_one, of_other = (result.parameters[name] for result in (weighed, free))
+        assert abs(of_one.value - of_other.value) < 0.01 * of_other.std
 
 
 @pytest.mark.slow

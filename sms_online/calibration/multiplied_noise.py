@@ -25,6 +25,8 @@ from sms_online.stream import Array
 
 # Deviations of a row that noise makes.
 LARGEST = 4.0
+# Samples of the noise: what share of a row's variance it is follows from the mean of their squares.
+SAMPLES = 8
 # The synthetic noise is the same in every session, so that the same samples give the same bits.
 SEED = 11
 
@@ -64,40 +66,41 @@ class MultipliedNoise(Stage):
 
     def begin_segment(self) -> None:
         """The next window shares no samples with those before."""
-        none = np.empty((0, self._sensors + len(self._joint_rows)))
+        none = np.empty((0, self._sensors + len(self._joint_rows), SAMPLES))
         self.state = MultipliedNoiseState(np.random.default_rng(SEED), none)
 
     def push(self, kernels: Array, sensor_density: Array, torque_density: Array) -> Array:
-        """What the noise of each nuisance's readings adds to the rows of the next windows, (W, n_v, nuisances).
+        """Samples of what the noise of each nuisance's readings adds to the rows of the next windows.
+
+        (W, n_v, nuisances, SAMPLES).
 
         kernels (W, STEPS + 1, n_v, sensors), sensor_density (sensors,), torque_density (joints,): see
         `RowNoise.covariances`.
         """
         W, _, n_v, sensors = kernels.shape
-        out = np.zeros((W, n_v, len(self._multiplied)))
+        out = np.zeros((W, n_v, len(self._multiplied), SAMPLES))
         if not (W and self._multiplied):
             return out
         now = self.state
         missing = STEPS + 1 + (W - 1) * STEPS_A_HOP - len(now.steps)
-        steps = np.concatenate((now.steps, now.random.standard_normal((missing, now.steps.shape[1]))))
+        steps = np.concatenate((now.steps, now.random.standard_normal((missing, *now.steps.shape[1:]))))
         now.steps = steps[W * STEPS_A_HOP :]
         size = np.sqrt(self._step * np.concatenate((sensor_density, torque_density)))
         at = STEPS_A_HOP * np.arange(W)[:, None] + np.arange(STEPS + 1)
-        noise = steps[at] * size  # (W, STEPS + 1, sensors + joints)
-        torque = self._phi @ noise[:, :, sensors:]
-        for column, each in zip(out.transpose(2, 0, 1), self._multiplied, strict=True):
+        noise = steps[at] * size[:, None]  # (W, STEPS + 1, sensors + joints, SAMPLES)
+        torque = np.tensordot(noise[:, :, sensors:], self._phi, (1, 0))
+        for column, each in zip(out.transpose(2, 0, 1, 3), self._multiplied, strict=True):
             if each.sensors:
                 seen = list(each.sensors)
-                column -= np.einsum("wkvs,wks->wv", kernels[..., seen], noise[..., seen], optimize=True)
+                column -= np.einsum("wkvs,wksc->wvc", kernels[..., seen], noise[:, :, seen], optimize=True)
             for i in each.joints:
                 column[:, self._joint_rows[i]] += torque[:, i]
         return out
 
 
 class SharesState(State):
-    """Sums of squares over windows (n_v,): of whitened synthetic rows (n_v, nuisances), and of residuals (n_v,)."""
+    """Sums of squares of residuals over windows (n_v,), and how many windows."""
 
-    synthetic: Array
     residual: Array
     windows: Array
 
@@ -112,27 +115,28 @@ class Shares(Stage):
 
     def begin(self) -> None:
         """Rows of other weights are next."""
-        self.state = SharesState(np.zeros((self._n_v, len(self._columns))), *np.zeros((2, self._n_v)))
+        self.state = SharesState(*np.zeros((2, self._n_v)))
 
     def taken_off(self, N: Array, synthetic: Array, residual: Array) -> tuple[Array, Array]:
         """N (n_v, ·) without what it shares with the residual (n_v,), and the noise (n_v, nuisances) that stays in it.
 
-        synthetic (n_v, nuisances): a sample of that noise; rows are whitened, or divided by their deviations. Of a
+        synthetic (n_v, nuisances, SAMPLES): of that noise; rows are whitened, or divided by their deviations. Of a
         residual that noise does not make, as of an estimate from a few rows, nothing follows: there all of it stays.
         """
         now, noise = self.state, np.abs(residual) < LARGEST
         own = np.where(noise, residual, 0.0)
-        now.synthetic, now.residual = now.synthetic + noise[:, None] * synthetic**2, now.residual + own**2
-        now.windows = now.windows + noise
+        now.residual, now.windows = now.residual + own**2, now.windows + noise
         out = N.copy()
-        out[:, self._columns] -= shares(now.synthetic, now.residual, now.windows) * own[:, None]
-        return out, synthetic * ~noise[:, None]
+        out[:, self._columns] -= shares(synthetic, now.residual, now.windows) * own[:, None]
+        return out, synthetic[..., 0] * ~noise[:, None]
 
 
 def shares(synthetic: Array, residual: Array, windows: float | Array) -> Array:
-    """Shares (n_v, nuisances) of noise in the residuals of rows, from sums of squares over windows: `SharesState`.
+    """Shares (…, n_v, nuisances) of noise in the residuals of rows, from samples of it (…, n_v, nuisances, SAMPLES).
 
-    Residuals larger than noise makes them are those of a poor fit; smaller ones mean that noise is overstated.
+    Row by row, as noise is most of it in some and little where an axis sticks. No share is bounded by one: the means of
+    few squares would come out low. residual: sum of their squares (n_v,) over so many windows. Larger ones than noise
+    makes are those of a poor fit; smaller ones mean that noise is overstated.
     """
-    variance = np.minimum(residual, windows)[:, None]
-    return np.minimum(np.divide(synthetic, variance, out=np.zeros_like(synthetic), where=variance > 0.0), 1.0)
+    variance = np.divide(residual, windows, out=np.ones_like(residual), where=(residual > 0.0) & (residual < windows))
+    return np.asarray(np.mean(synthetic**2, axis=-1) / variance[:, None])

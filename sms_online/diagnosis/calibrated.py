@@ -37,7 +37,7 @@ class Calibrated:
     """Nuisances (m) with their columns (W, n_v, m) in the rows, as `SessionRows` has them once it is whitened.
 
     covered: see that function. multiplied: what they and gains of torques multiply, with rows of synthetic noise
-    (W, n_v, ·) of each, see `MultipliedNoise`.
+    (W, n_v, ·, SAMPLES) of each, see `MultipliedNoise`.
     """
 
     nuisances: tuple[Nuisance, ...]
@@ -62,7 +62,7 @@ class Calibrated:
     def none(cls, rows: Array) -> Calibrated:
         """Nothing that the description may be off by, in rows (W, n_v)."""
         nothing = np.empty((*rows.shape, 0))
-        return cls((), nothing, frozenset(), (), nothing)
+        return cls((), nothing, frozenset(), (), nothing[..., None])
 
     @property
     def count(self) -> int:

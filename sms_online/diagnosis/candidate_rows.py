@@ -192,19 +192,20 @@ class CandidateRows(CandidateFits):
         near = width if self._scale.freed else 0
         self._known = len(known) + near + self.calibrated.count
         candidates = (candidate.columns for candidate in self.candidates)
-        parts = [self._model, rows.b[..., None], self.calibrated.columns, self.calibrated.synthetic, *candidates]
+        samples = self.calibrated.synthetic.reshape(*rows.b.shape, -1)
+        parts = [self._model, rows.b[..., None], self.calibrated.columns, samples, *candidates]
         white = self._whitened(np.concatenate(parts, axis=2))
         white[first : first + len(known), :n], white[first : first + len(known), width] = known[:, :-1], known[:, -1]
         ends = np.cumsum([part.shape[2] for part in parts])
         self._white, b, self._N, synthetic, *self._Z = np.split(white, ends[:-1], axis=1)
         self._white_b = b[:, 0]
-        self._take_off_noise(synthetic[:first].reshape(*rows.b.shape, -1))
+        self._take_off_noise(synthetic[:first].reshape(self.calibrated.synthetic.shape))
         self._linearise()
 
     def _take_off_noise(self, synthetic: Array) -> None:
         """Take off columns of gains what rows say of the noise that they multiply, see `multiplied_noise`.
 
-        synthetic (W, n_v, ·): whitened rows of such noise.
+        synthetic (W, n_v, ·, SAMPLES): whitened rows of such noise.
         """
         size, multiplied = self.rows.b.size, self.calibrated.multiplied
         gained = [
@@ -221,8 +222,8 @@ class CandidateRows(CandidateFits):
         m = self.calibrated.count
         beside[len(beside) - m :, beside.shape[1] - m :] = self.calibrated.information(np.zeros(m, dtype=np.bool_))
         residual = (self._white_b - beside @ least_squares(beside, self._white_b))[:size].reshape(self.rows.b.shape)
-        squares = np.sum(synthetic**2, axis=0), np.sum(residual**2, axis=0)
-        expected = (shares(*squares, len(synthetic)) * residual[:, :, None]).reshape(size, -1)
+        of_noise = shares(synthetic, np.sum(residual**2, axis=0), len(synthetic))
+        expected = (of_noise * residual[:, :, None]).reshape(size, -1)
         for k, column, sign in gained:
             column += sign * expected[:, k]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sms_online.calibration.columns import CalibrationColumns, nuisances
-from sms_online.calibration.multiplied_noise import Multiplied
+from sms_online.calibration.multiplied_noise import SAMPLES, Multiplied
 from sms_online.diagnosis.calibrated import Calibrated
 from sms_online.diagnosis.followed import FollowedMotion
 from sms_online.diagnosis.record import Segment
@@ -194,7 +194,7 @@ class SessionRows(WeakRows):
         self.responses = dict(zip(DISPLACEMENTS, np.moveaxis(stacked, 1, 0), strict=True))
         of_calibration = np.array(columns).reshape(self.count, model.layout.n_v, calibration.count)
         multiplied = (*calibration.multiplied, *gains)
-        of_noise = np.array(synthetic).reshape(self.count, model.layout.n_v, len(multiplied))
+        of_noise = np.array(synthetic).reshape(self.count, model.layout.n_v, len(multiplied), SAMPLES)
         self.calibrated = Calibrated.of(nuisances(sensing), of_calibration, model.system, multiplied, of_noise)
         self.have_noise(covariances)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sms_online.calibration.multiplied_noise import Shares
+from sms_online.calibration.multiplied_noise import SAMPLES, Shares
 from sms_online.pipeline.latency import LatencyColumns, SourceGroup
 from sms_online.pipeline.momentum_windows import Window
 from sms_online.pipeline.sensor_noise import SensorNoise
@@ -63,7 +63,7 @@ class WindowWhitening(Stage):
         self.noise = noise
         self.state = WindowWhiteningState(np.zeros(noise.n_v), np.zeros(noise.nuisances))
         self._late = LatencyColumns(sources)
-        self._whitener = Whitener(width + len(sources) + noise.nuisances + len(noise.multiplied))
+        self._whitener = Whitener(width + len(sources) + noise.nuisances + SAMPLES * len(noise.multiplied))
         self._plain_shares = Shares(noise.multiplied, noise.n_v)
         self._shares = Shares(noise.multiplied, noise.n_v)
 
@@ -108,19 +108,21 @@ class WindowWhitening(Stage):
         calibrated = width + len(self._late)
         if len(self._late):
             rows = np.concatenate((rows, self._late.of(noise.late)), axis=1)
-        rows = np.concatenate((rows, noise.calibration, noise.multiplied), axis=1)
+        samples = noise.multiplied.shape
+        rows = np.concatenate((rows, noise.calibration, noise.multiplied.reshape(samples[0], -1)), axis=1)
         white = self._whitener.push(noise.covariances, rows)
         multiplied = calibrated + noise.calibration.shape[1]
         calibration = noise.calibration, white[:, calibrated:multiplied]
-        synthetic = noise.multiplied, white[:, multiplied:]
+        synthetic = noise.multiplied, white[:, multiplied:].reshape(samples)
+        kept = synthetic[0][..., 0], synthetic[1][..., 0]
         if len(self.noise.multiplied):
             std = np.sqrt(np.diag(own))[:, None]
             plain, whitened = calibration[0] / std, calibration[1]
             residuals = self._residual(rows / std, plain), self._residual(white, whitened)
-            plain, left = self._plain_shares.taken_off(plain, synthetic[0] / std, residuals[0])
+            plain, left = self._plain_shares.taken_off(plain, synthetic[0] / std[:, None], residuals[0])
             whitened, white_left = self._shares.taken_off(whitened, synthetic[1], residuals[1])
-            calibration, synthetic = (std * plain, whitened), (std * left, white_left)
-        return WhitenedWindow(white[:, :width], white[:, width:calibrated], calibration, synthetic, of_noise, own)
+            calibration, kept = (std * plain, whitened), (std * left, white_left)
+        return WhitenedWindow(white[:, :width], white[:, width:calibrated], calibration, kept, of_noise, own)
 
     def refer(self, joint: Array) -> None:
         """Take the newest estimate of nuisances, beside those that samples are corrected by, and of β (m + n,)."""
