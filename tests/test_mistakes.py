@@ -135,6 +135,23 @@ def test_a_wrong_gear_is_corrected_in_the_system() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("true", "said"),
+    [((0.0, 0.0, 0.0), (0.0, -9.81, 0.0)), ((0.0, -9.81, 0.0), (0.0, 0.0, 0.0)), ((0.0, -9.81, 0.0), (0.0, 9.81, 0.0))],
+)
+def test_gravity_along_another_axis_is_named(true: tuple[float, ...], said: tuple[float, ...]) -> None:
+    """None where the description has some, the reverse, and the planar example upside down."""
+    system = load_system("paper-planar").model_copy(update={"gravity": true, "spacecraft": None})
+    block = noisy(simulate(system, DURATION, position_tolerance=1e-8), 4)
+    wrongly = described(system, np.random.default_rng(1)).model_copy(update={"gravity": said})
+    corrected = found_in(block, wrongly)
+    assert [mistake.key for mistake in corrected.mistakes] == ["gravity@base"]
+    assert corrected.system.gravity == true
+    text = adopted_text("paper-planar", wrongly, corrected.system, {})
+    assert f"gravity = [{', '.join(f'{g:g}' for g in true)}] # m/s², found; the file said [" in text
+
+
+@pytest.mark.slow
 def test_a_wrong_torque_constant_is_no_wrong_gear() -> None:
     corrected = found(times(1.6, "tau_2"))
     assert [mistake.key for mistake in corrected.mistakes] == ["gear_ratio@joint_2"]

@@ -54,6 +54,8 @@ MOST = 3
 LIKELY = 3.0
 # A gear is described as smaller or larger by less than this factor.
 LARGEST_GEAR = 30.0
+# What falls where a description has no gravity, m/s².
+FALL = 9.81
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ class _Search:
         if not found:
             found = list(self._scaled(rows, freed))
             if _left(given, PHYSICS) > LEAST_RATIO:
-                likely = self._likely(mistake_hypotheses(self.system, self._channels))
+                every = (*mistake_hypotheses(self.system, self._channels), *_gravities(self.system))
+                likely = self._likely(every)
                 found += self._samples(likely, given, PHYSICS, LEAST_RATIO)
         if not found:
             return False
@@ -178,10 +181,8 @@ class _Search:
         A rotor's inertia acts with the square of the ratio on its own joint and with the ratio on the bodies that it
         turns with: that distinguishes a gear from a torque constant.
         """
-        assert geared.system is not None
-        system = geared.system(self.system)
         try:
-            fit = RoughRows(Estimator(system, self._channels, ""), self._segments).freed()
+            fit = self._rows(geared, self._segments).freed()
         except np.linalg.LinAlgError:
             return tried
         return _Tried(geared, fit) if _finely(fit) < _finely(tried.fit) else tried
@@ -191,9 +192,18 @@ class _Search:
         self._undone.append(u)
         self.found.append(Mistake(u.name, u.where, u.sentence, u.step, before, _left(best.fit), others))
         self._segments = self._corrected(u, self._segments)
-        if u.system is not None:
-            self.system = u.system(self.system)
-            self.session = Estimator(self.system, self.session.sensing.channels, "")
+        self.system, self.session = self._session(u)
+
+    def _session(self, hypothesis: MistakeHypothesis) -> tuple[System, Estimator]:
+        """System and session without a mistake of the description."""
+        if hypothesis.system is None:
+            return self.system, self.session
+        system = hypothesis.system(self.system)
+        return system, Estimator(system, self._channels, "")
+
+    def _rows(self, hypothesis: MistakeHypothesis, segments: Sequence[Segment]) -> RoughRows:
+        """Rows of some segments without a mistake; numpy.linalg.LinAlgError as `RoughRows` raises it."""
+        return RoughRows(self._session(hypothesis)[1], self._corrected(hypothesis, segments))
 
     def _corrected(self, hypothesis: MistakeHypothesis, segments: Sequence[Segment]) -> list[Segment]:
         made = (replace(each, values=hypothesis.apply(self._channels, each.values)) for each in segments)
@@ -211,7 +221,7 @@ class _Search:
         least = _left(rows.fit(), PHYSICS) / np.sqrt(LEAST_RATIO)
         for hypothesis in tried:
             try:
-                left = _left(RoughRows(self.session, self._corrected(hypothesis, first)).fit(), PHYSICS)
+                left = _left(self._rows(hypothesis, first).fit(), PHYSICS)
             except np.linalg.LinAlgError:
                 continue  # readings that no shape of the links gives
             if left <= least:
@@ -226,7 +236,7 @@ class _Search:
         """
         for hypothesis in tried:
             try:
-                rows = RoughRows(self.session, self._corrected(hypothesis, self._segments))
+                rows = self._rows(hypothesis, self._segments)
                 better = _left(given, explained) / _left(rows.fit(), explained) > least
             except np.linalg.LinAlgError:
                 continue  # readings that no shape of the links gives
@@ -322,6 +332,26 @@ def _listed(names: Sequence[str]) -> str:
 
 def _same(channels: tuple[str, ...], values: Array) -> Array:
     return values
+
+
+def _gravities(system: System) -> Iterator[MistakeHypothesis]:
+    """Gravity along another axis of the base, or none: an arm that hangs, or leans on a wall."""
+    described = np.array(system.gravity)
+    size = float(np.linalg.norm(described)) or FALL
+    axes = np.eye(3)[: 2 if system.motion == "planar" else 3]
+    for vector in (np.zeros(3), *(sign * size * axis for axis in axes for sign in (1.0, -1.0))):
+        if np.linalg.norm(vector - described) < 0.5 * size:
+            continue
+        found = tuple(vector.tolist())
+        new, old = (f"({', '.join(f'{g:g}' for g in each)}) m/s²" for each in (found, system.gravity))
+        said = f"gravity looks like {new}, described as {old}"
+        yield MistakeHypothesis(
+            "gravity", "base", said, "check how the base is mounted, then `gravity`", _same, _falling(found)
+        )
+
+
+def _falling(gravity: tuple[float, ...]) -> Callable[[System], System]:
+    return lambda system: system.model_copy(update={"gravity": gravity})
 
 
 def _geared(i: int, factor: float) -> Callable[[System], System]:

@@ -172,6 +172,18 @@ def markers(values: Values, system: System, rng: np.random.Generator) -> str:
     return f"swapped@link_{link}.marker_1.*, link_{link}.marker_2.*"
 
 
+def gravity(values: Values, system: System, rng: np.random.Generator) -> str:
+    """See `falling`."""
+    return "gravity@base"
+
+
+def falling(system: System, rng: np.random.Generator) -> System:
+    """The system described with gravity along an axis of the base, of which the samples have none."""
+    vector = np.zeros(3)
+    vector[int(rng.integers(2 if system.motion == "planar" else 3))] = rng.choice([-9.81, 9.81])
+    return system.model_copy(update={"gravity": tuple(vector.tolist())})
+
+
 def clean(values: Values, system: System, rng: np.random.Generator) -> str:
     return ""
 
@@ -180,7 +192,7 @@ MISTAKES: dict[str, Callable[[Values, System, np.random.Generator], str]] = {
     make.__name__: make
     for make in (
         torque_sign, angle_sign, swapped, degrees, millimetres, torque_unit, clock_unit, joint_torque, torque_constant,
-        gear_ratio, motor_angle, encoder, held_command, zero_offset, markers, clean,
+        gear_ratio, motor_angle, encoder, held_command, zero_offset, markers, gravity, clean,
     )
 }  # fmt: skip
 
@@ -206,6 +218,8 @@ def case(name: str, cache: Path, seed: int, mistake: str) -> Record:
     stated = described(system, rng)
     if mistake == gear_ratio.__name__:
         stated = other_gear(stated, key, rng)
+    if mistake == gravity.__name__:
+        stated = falling(stated, rng)
     found = diagnose(stated, [wrong], "case", lambda _: None)
     keys = [each.key for each in found.mistakes] + [finding.candidate.key for finding in found.findings]
     return {
