@@ -342,7 +342,7 @@ def _gravities(system: System) -> Iterator[MistakeHypothesis]:
     for vector in (np.zeros(3), *(sign * size * axis for axis in axes for sign in (1.0, -1.0))):
         if np.linalg.norm(vector - described) < 0.5 * size:
             continue
-        found = tuple(vector.tolist())
+        found = tuple((vector + 0.0).tolist())  # no negative zeros
         new, old = (f"({', '.join(f'{g:g}' for g in each)}) m/s²" for each in (found, system.gravity))
         said = f"gravity looks like {new}, described as {old}"
         yield MistakeHypothesis(

@@ -27,8 +27,8 @@ def adopted_text(described: str, before: System, after: System, remarks: Mapping
     lines = system_text(described).rstrip().splitlines()
     if after.gravity != before.gravity:
         stated = [k for k, line in enumerate(lines) if re.match(r"\s*gravity\s*=", line)]
-        found, said = (", ".join(f"{g:.9g}" for g in each.gravity) for each in (after, before))
-        gravity = f"gravity = [{found}] # m/s², found; the file said [{said}]"
+        new, old = (", ".join(f"{g:.9g}" for g in each.gravity) for each in (after, before))
+        gravity = f"gravity = [{new}] # m/s², found; the file said [{old}]"
         if stated:
             lines[stated[0]] = gravity
         else:
