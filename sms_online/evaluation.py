@@ -30,6 +30,8 @@ from sms_online.trackers.interface import Estimate, Prior
 NORMAL_95 = 1.959963984540054
 # An estimate within three standard deviations of zero is not determined by the data: not even its sign is certain.
 LARGEST_RELATIVE_STD = 1.0 / 3.0
+# Ratios of parameters are determined where those of this share of them are.
+LEAST_RATIOS = 1.0 / 3.0
 # Information that is less than this share of what it is a difference of is rounding.
 ROUNDED = 1e-9
 # Mean square of rows over their predicted variance that noise alone may leave: that of the noise is estimated to 7 %.
@@ -41,6 +43,14 @@ LARGEST_BIAS = 1.0
 def identifiable(beta: Array, std: Array) -> Mask:
     """Which parameters β (n,) the data determine: std (n,) is finite, and β three of it from zero."""
     return np.asarray(std <= LARGEST_RELATIVE_STD * np.abs(beta))
+
+
+def ratios_determined(beta: Array, covariance: Array) -> bool:
+    """Whether many parameters β (n,) of a covariance (n, n) are `identifiable` once one of them is held."""
+    variance = np.diag(covariance)
+    # Of each parameter where one is held, column by column.
+    std = np.sqrt(np.maximum(0.0, variance[:, None] - covariance**2 / variance))
+    return bool(np.max(np.mean(identifiable(beta[:, None], std), axis=0)) > LEAST_RATIOS)
 
 
 def beside_prior(estimate: Estimate, std: Array, prior: Prior) -> tuple[Array, Array]:
@@ -157,6 +167,14 @@ class Evaluation:
         if prior is None or prior.correlation is not None:
             return out
         return out & identifiable(*beside_prior(estimate, std, prior))
+
+    @cached_property
+    def scale_alone(self) -> bool:
+        """Whether no parameter is determined for want of the scale, see `ratios_determined`."""
+        estimate, known = self.estimate, np.flatnonzero(np.isfinite(self.std) & self.estimate.determined)
+        if self.determined.any() or self.explains_nothing or not known.size:
+            return False
+        return ratios_determined(estimate.pi[known], estimate.covariance[np.ix_(known, known)])
 
     @property
     def explains_nothing(self) -> bool:

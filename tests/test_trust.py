@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sms_online.description.parse import parse_system
+from sms_online.evaluation import ratios_determined
 from sms_online.nominal import Apart, NominalComparison
 from sms_online.pipeline.estimator import Estimator
 from sms_online.row_types import Residual
@@ -129,6 +131,22 @@ def test_nothing_is_missing_beside_torques_that_are_noise() -> None:
     assert undetermined.sentence == "Not yet: weak data: 100 % of the torque or force of joint_1 is noise"
     wrong = judge(replace(weak, residual={"joint_1": Residual(1.7, 9.0)}))
     assert wrong.grave
+
+
+def test_known_values_that_noise_hides_are_said() -> None:
+    evidence = replace(GOOD, determined=(0, 16), unconverged="no parameter is determined", unscaled=("payload.mass",))
+    judgement = judge(evidence)
+    assert judgement.level == "not yet"
+    assert judgement.reasons[0].startswith("ratios of parameters are determined, not their scale")
+    assert judgement.next_step.startswith("leave `[known]` out")
+
+
+def test_ratios_are_determined_where_one_held_parameter_determines_the_others() -> None:
+    """A scale that is five times uncertain, and one per cent of each parameter beside it; without, and as noise."""
+    beta = np.array([1.0, 20.0, 300.0, -4.0])
+    own = np.diag((0.01 * beta) ** 2)
+    assert ratios_determined(beta, own + 25.0 * np.outer(beta, beta))
+    assert not ratios_determined(beta, np.diag((5.0 * beta) ** 2))
 
 
 def test_no_diagnosis_is_asked_for_where_there_are_no_rows() -> None:

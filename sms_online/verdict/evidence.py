@@ -51,6 +51,7 @@ class Evidence:
     determined: number of parameters that the data determine, and of all.
     undetermined: names of the others.
     unconverged: why the estimate will still move by more than its error bars; empty where it will not.
+    unscaled: names of known values that leave the scale of all parameters to noise, where nothing else is lacking.
     silent: since when, s, nothing has come of sources or channels; -inf where it never has.
     residual: of each type of rows.
     negative: names of parameters that are negative and must not be.
@@ -82,6 +83,7 @@ class Evidence:
     determined: tuple[int, int]
     undetermined: tuple[str, ...] = ()
     unconverged: str = ""
+    unscaled: tuple[str, ...] = ()
     silent: Mapping[str, float] = field(default_factory=dict)
     residual: Residuals = field(default_factory=dict)
     negative: tuple[str, ...] = ()

@@ -39,6 +39,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         determined=(int(np.count_nonzero(flags)), flags.size),
         undetermined=tuple(p.name for p, known in zip(evaluation.parameters, flags, strict=True) if not known),
         unconverged=_unconverged(evaluation),
+        unscaled=tuple(now.setup.system.known) if evaluation.scale_alone else (),
         silent=_silent(now),
         residual=evaluation.residuals,
         negative=tuple(evaluation.negative),

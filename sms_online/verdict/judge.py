@@ -51,7 +51,8 @@ def _judged(evidence: Evidence) -> Trust:
         # What keeps samples from coming is to be mended before anybody moves more.
         first = [*sample_reasons.silenced(evidence.silent), *sample_reasons.troubled(evidence.troubles)]
         rest = _cautions(replace(evidence, troubles=()))
-        why = [reasons.unconverged(evidence.unconverged), *samples]
+        unscaled = reasons.unscaled(evidence.unscaled) if evidence.unscaled else None
+        why = [unscaled or reasons.unconverged(evidence.unconverged), *samples]
         # Where nothing is determined, the weak motion is why.
         why = [*why, *weak] if evidence.determined[0] else [*weak, *why]
         return Trust("not yet", (*first, *why, *rest))

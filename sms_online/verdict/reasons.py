@@ -55,12 +55,19 @@ FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, dri
 LONGER = "record for longer: so few windows do not show whether it is noise of the torques or a force; else "
 OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
+NO_KNOWN = "leave `[known]` out, so that joint_1's torque gives the scale, or weigh a heavier part"
 MOVE = "move all joints, faster and over a larger range, and long enough"
 
 
 def unconverged(why: str) -> Reason:
     """An estimate that will still move by more than its error bars."""
     return Reason(why, False, then=MOVE)
+
+
+def unscaled(names: Sequence[str]) -> Reason:
+    """Known values whose effect on the rows noise hides: ratios of parameters are determined, and no scale."""
+    text = f"ratios of parameters are determined, not their scale: noise hides what {listed(names)} adds to the rows"
+    return Reason(text, False, then=NO_KNOWN)
 
 
 def scaled(comparison: NominalComparison) -> list[Reason]:
