@@ -95,6 +95,7 @@ def test_a_session_without_a_mistake_has_none() -> None:
         (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
         pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.long),
         pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.long),
+        pytest.param(times(2.0, "q_2"), "counts@q_2", "reads twice the angle", marks=pytest.mark.long),
         pytest.param(times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear", marks=pytest.mark.long),
         pytest.param(swap("tau_1", "tau_2"), "swapped@tau_1, tau_2", "are swapped", marks=pytest.mark.slow),
     ],

@@ -70,6 +70,7 @@ def mistake_hypotheses(system: System, channels: Sequence[str]) -> Iterator[Mist
     yield from _units(system, positions)
     yield from _converted_twice(system, positions)
     yield from _geared(system, channels)
+    yield from _counts(channels)
     yield from _swaps(channels)
 
 
@@ -164,6 +165,18 @@ def _geared(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothes
             n = joint.gear_ratio
             said = f"{name} is the motor's angle before the gear, {n:g} × the angle after it"
             yield MistakeHypothesis("motor_angle", name, said, f"divide {name} by {n:g}", scaled([name], 1.0 / n))
+
+
+def _counts(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
+    """Encoders of other counts a turn, as quadrature counts twice or four times, or behind another gear."""
+    joints = grouped((name.rpartition("_")[2], name) for name in channels if name.startswith(("q_", "theta_m_")))
+    single = [[name] for names in joints.values() for name in names]
+    for names in (*single, *(names for names in joints.values() if len(names) == 2)):
+        where = ", ".join(names)
+        for times, words in ((4.0, "4 ×"), (2.0, "twice"), (0.5, "half"), (0.25, "a quarter of")):
+            said = f"{where} reads {words} the angle: counts a turn, or the gear of its source"
+            then = f"check counts and gear of {where}, or multiply it by {1.0 / times:g}"
+            yield MistakeHypothesis("counts", where, said, then, scaled(names, 1.0 / times))
 
 
 def _swaps(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:

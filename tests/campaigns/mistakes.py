@@ -172,6 +172,13 @@ def markers(values: Values, system: System, rng: np.random.Generator) -> str:
     return f"swapped@link_{link}.marker_1.*, link_{link}.marker_2.*"
 
 
+def counts(values: Values, system: System, rng: np.random.Generator) -> str:
+    """An encoder of a flexible joint has other counts a turn than its source states."""
+    name = f"{rng.choice(['theta_m', 'q'])}_{int(rng.integers(1, 3))}"
+    _times(values, [name], float(rng.choice([0.25, 0.5, 2.0, 4.0])))
+    return f"counts@{name}"
+
+
 def gravity(values: Values, system: System, rng: np.random.Generator) -> str:
     """See `falling`."""
     return "gravity@base"
@@ -192,7 +199,7 @@ MISTAKES: dict[str, Callable[[Values, System, np.random.Generator], str]] = {
     make.__name__: make
     for make in (
         torque_sign, angle_sign, swapped, degrees, millimetres, torque_unit, clock_unit, joint_torque, torque_constant,
-        gear_ratio, motor_angle, encoder, held_command, zero_offset, markers, gravity, clean,
+        gear_ratio, motor_angle, encoder, held_command, zero_offset, markers, counts, gravity, clean,
     )
 }  # fmt: skip
 
