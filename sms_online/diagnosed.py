@@ -12,9 +12,9 @@ from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System
-from sms_online.diagnosis.diagnose import diagnose as search_for_effects
 from sms_online.diagnosis.document import diagnosis_document, trust_of
 from sms_online.diagnosis.mistakes import Mistake
+from sms_online.diagnosis.reconstructed import diagnose_recorded
 from sms_online.diagnosis.search import Search
 from sms_online.effects.build import build_model
 from sms_online.errors import InputError
@@ -135,8 +135,8 @@ def diagnose(
     with what is being done, a few words, and the share of all that is done, roughly. stop: is asked between steps
     whether to end with a partial verdict. learned: whether a curve may be named where no law of the catalogue is.
     Where parameters jump within the capture, one part of it is searched.
-    Raises InputError where the data cannot be read or do not fit the system, a coordinate is not measured, or there is
-    too little motion.
+    Raises InputError where the data cannot be read or do not fit the system, a sensor that it needs is missing, or
+    there is too little motion.
     """
     system, folder = given_system(system)
     recorded, *others = [recorded_session(system, each, folder) for each in _several(data)]
@@ -160,11 +160,12 @@ def diagnose(
         return base_prior(system, estimator.base, beforehand) if beforehand or system.priors else None
 
     name = ", ".join(each.name for each in (recorded, *others))
-    found = search_for_effects(system, blocks, name, known, held, progress, stop, learned, further)
-    true = None if recorded.truth is None else true_values(recorded.truth, system, found.after.system)
+    found, said = diagnose_recorded(system, [blocks, *further], held, name, known, progress, stop, learned)
+    warnings += said
+    described = found.adopted
+    true = None if recorded.truth is None else true_values(recorded.truth, system, described)
     document = diagnosis_document(found, warnings, true)
     after = Fit._of(document["after"])
-    described = found.after.system
     base = find_base_parameters(build_model(described))
     return Diagnosis(
         verdict=found.verdict,

@@ -14,7 +14,7 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.row_types import Residual
 from sms_online.verdict.evidence import Discrepancy, Dispute, Evidence
 from sms_online.verdict.judge import judge, judge_diagnosis
-from sms_online.verdict.reasons import CHECK_ROWS, DECLARE, MOVE, place_of
+from sms_online.verdict.reasons import CHECK_ROWS, MOVE, place_of
 from sms_online.verdict.trust import LONGEST_SENTENCE, Reason
 from tests.axis import AXIS, axis_block
 from tests.evaluated import judged, results_document
@@ -147,13 +147,6 @@ def test_ratios_are_determined_where_one_held_parameter_determines_the_others() 
     own = np.diag((0.01 * beta) ** 2)
     assert ratios_determined(beta, own + 25.0 * np.outer(beta, beta))
     assert not ratios_determined(beta, np.diag((5.0 * beta) ** 2))
-
-
-def test_no_diagnosis_is_asked_for_where_there_are_no_rows() -> None:
-    wrong = with_row("joint_1", relative=0.9, whitened=9.0)
-    assert "sms-online diagnose" in judge(wrong).next_step
-    smoothed = judge(replace(wrong, smoothed=True))
-    assert smoothed.next_step == f"check sign, unit and gear ratio of that torque; else {DECLARE}"
 
 
 def test_the_named_effect_comes_before_its_residual() -> None:

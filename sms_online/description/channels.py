@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 
 from sms_online.description.bodies import Deformation, FlexibleLink, Joint
@@ -114,6 +115,11 @@ def _link_channels(i: int, link: FlexibleLink, planar: bool) -> list[str]:
     return [f"link_{i}.marker_{j}.{field}" for j in range(1, len(link.points) + 1) for field in fields] + [
         f"link_{i}.strain_angle"
     ]
+
+
+def concerns(where: str, names: Iterable[str]) -> bool:
+    """Whether a place, or one of several with commas between them, is one of some channels or a pattern of theirs."""
+    return any(fnmatchcase(name, pattern) for pattern in where.split(", ") for name in names)
 
 
 def channel_unit(system: System, channel: str) -> str:

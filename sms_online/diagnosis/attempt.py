@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sms_online.description.channels import concerns
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.candidate_rows import CandidateRows
 from sms_online.diagnosis.candidates import CandidateColumns
@@ -95,6 +96,7 @@ class Case:
 
     progress: see `Progress`. stop: whether to end with what has been found. learned: whether curves are tried where no
     law is selected. begins: of further captures, see `captures`. use_prior: whether a search heeds the prior.
+    reconstructed: channels that no sensor reads, of which no effect is looked for.
     """
 
     source: str
@@ -108,6 +110,7 @@ class Case:
     learned: bool = False
     begins: tuple[float, ...] = ()
     use_prior: bool = True
+    reconstructed: tuple[str, ...] = ()
 
 
 def _noise_behind(described: Estimator, case: Case) -> SensorNoise:
@@ -167,7 +170,11 @@ class Attempt(Hypothesis):
             raise InputError(case.source, "", f"too few windows of {span:g} s: {rows.count}", expected)
         capture = np.searchsorted(case.begins, rows.time)
         folds = Folds.of(rows.weak.windows.segment, rows.time, capture=capture)
-        effects = list(make.effects(case.learned)) if candidates is None else candidates
+        if candidates is None:
+            every = make.effects(case.learned)
+            effects = [effect for effect in every if not concerns(effect.where, case.reconstructed)]
+        else:
+            effects = list(candidates)
         self._lasting = [effect for effect in effects if is_constant(effect)]
         forces = [effect for effect in effects if not is_constant(effect)]
         made = make.seen(forces) if candidates is None else [make.of(effect) for effect in forces]

@@ -54,12 +54,14 @@ def diagnose(
     stop: Callable[[], bool] = lambda: False,
     learned: bool = False,
     further: Sequence[Sequence[Block]] = (),
+    reconstructed: tuple[str, ...] = (),
 ) -> Search:
     """Trace what a capture holds beyond its description, adopt it and fit again.
 
     blocks: samples of the capture; holdout: those of another one of the same rig, to check on. progress: see
     `Progress`. stop: whether to end with what has been found so far. learned: whether curves are tried where no law is
     selected. further: captures of the same rig that are searched with the first, each predicted from the others.
+    reconstructed: channels that no sensor reads, see `smoother.reconstruction`.
     Raises InputError where a channel is missing or there is too little motion for any row.
     """
     runs = [blocks, *further]
@@ -72,7 +74,7 @@ def diagnose(
     )
     _noise(before, source)
     progress("looking for mistakes of units, signs and wiring", FITTED_ONCE)
-    corrected = find_mistakes(before, record.segments())
+    corrected = find_mistakes(before, record.segments(), reconstructed)
     mistakes = () if clock is None else (clock,)
     if corrected.mistakes:
         progress("; ".join(mistake.sentence for mistake in corrected.mistakes), FITTED_ONCE)
@@ -87,7 +89,7 @@ def diagnose(
     held = _held(system, holdout, source, prior)
     case = Case(
         source, before, _noise(before, source), record.segments(), held, prior, progress, stop, learned,
-        begins(runs),
+        begins(runs), reconstructed=reconstructed,
     )  # fmt: skip
     progress("tracing what it leaves", FITTED_ONCE)
     case, attempt = _first(case, system)
@@ -114,13 +116,17 @@ def diagnose(
     if drifts:
         return _drifting(case, followed, drifts, mistakes, zeros)
     late: list[LateSensor] = []
-    while (_explains_little(before) or attempt.tracing.exceeds) and (found := find_late(attempt.rows)):
+    while (_explains_little(before) or attempt.tracing.exceeds) and (found := find_late(attempt.rows, reconstructed)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         attempt = Attempt(case, declaring(attempt.system, [found.effect]))
     progress("searching for effects", TRACED)
     chosen = attempt.search()
-    if not (late or chosen or stop()) and _beyond(attempt, chosen) and (found := find_late(attempt.rows)):
+    if (
+        not (late or chosen or stop())
+        and _beyond(attempt, chosen)
+        and (found := find_late(attempt.rows, reconstructed))
+    ):
         # All candidates together may explain what none of them does, by parameters that vanish.
         lagging = Attempt(case, declaring(system, [found.effect]))
         others = lagging.search()
@@ -243,8 +249,9 @@ def _part_of(
     part, change = diagnosed_part(runs[0], event, case.session.system.windows.momentum)
     case.progress(change.sentence, FITTED_ONCE)
     found = diagnose(
-        case.session.system, part, case.source, case.prior, holdout, case.progress, case.stop, case.learned
-    )
+        case.session.system, part, case.source, case.prior, holdout, case.progress, case.stop, case.learned,
+        reconstructed=case.reconstructed,
+    )  # fmt: skip
     return replace(
         found, mistakes=(*mistakes, *found.mistakes), zeros=[*zeros, *found.zeros], changes=(change, *found.changes)
     )
@@ -351,14 +358,25 @@ def _session(
     prior: PriorOf,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Estimator, SampleRecord]:
-    """A session of the blocks of some captures, one after the other, and their record.
-
-    progress: is called with the share of the samples processed.
-    """
+    """A session of the blocks of some captures, one after the other, and their record; see `run_through`."""
     estimator = Estimator(system, runs[0][0].channels, source, whole=True)
     _check_balanced(estimator, source)
     record = SampleRecord(system.sample_rate)
     estimator.observers.append(record)
+    run_through(estimator, runs, prior, progress)
+    return estimator, record
+
+
+def run_through(
+    estimator: Estimator,
+    runs: Sequence[Sequence[Block]],
+    prior: PriorOf,
+    progress: Callable[[float], None] = lambda share: None,
+) -> None:
+    """Give a session the blocks of some captures, one after the other, and end it.
+
+    progress: is called with the share of the samples processed.
+    """
     known = prior(estimator)
     if known is not None:
         estimator.set_prior(known)
@@ -370,4 +388,3 @@ def _session(
             estimator.push(block)
             progress(estimator.samples / samples)
     estimator.finish()
-    return estimator, record

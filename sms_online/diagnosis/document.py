@@ -22,7 +22,7 @@ from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import at_noise, judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
-from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, REPLAY_WHOLE, THEN_DIAGNOSE, undecided
+from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, MEASURE_SLOPES, REPLAY_WHOLE, THEN_DIAGNOSE, undecided
 from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -31,6 +31,8 @@ LEAST_FALL = 0.1
 # What was found by comparing whole descriptions competes with no columns.
 NO_RIVAL = {"next": None, "next_held_out_improvement": None}
 
+# Errors of reconstructed coordinates are correlated: measured on arms of two links, see docs/validation/diagnosis.md.
+ROUGH_BARS = "parameters are of reconstructed coordinates: errors may be three times the error bars"
 INTERRUPTED = "the search was interrupted, and has not decided what the model lacks"
 RUN_TO_THE_END = "let the diagnosis run to its end"
 
@@ -133,12 +135,22 @@ def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
         # Parameters come from the rows of the diagnosis then, see `posterior`.
         known = [p.determined for p in posterior(diagnosis.attempt, diagnosis.chosen)]
         trust = judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
+    if diagnosis.of_reconstructed:
+        trust = _of_reconstructed(trust, diagnosis.attempt.case.reconstructed)
     steps = [
         reason.then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE).removeprefix(IF_NOTHING)
         for reason in trust.grounds
     ]
     grounds = zip(trust.grounds, steps, strict=True)
     return replace(trust, grounds=tuple(replace(reason, then=step) for reason, step in grounds))
+
+
+def _of_reconstructed(trust: Trust, channels: Sequence[str]) -> Trust:
+    """The verdict on parameters that are of reconstructed coordinates: of these channels no sensor is to blame."""
+    grounds = () if trust.level == "trust" else trust.grounds
+    own = [each for each in grounds if not each.places or not set(each.places) <= set(channels)]
+    rough = Reason(ROUGH_BARS, False, then=MEASURE_SLOPES)
+    return Trust("not yet" if trust.level == "not yet" else "doubt", (*own, rough), trust.grave)
 
 
 def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:

@@ -16,6 +16,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from sms_online.description.channels import concerns
 from sms_online.description.schema import Effect
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.evidence import threshold
@@ -128,10 +129,13 @@ class Lags:
         return np.asarray(2.0 * self._independent * (before - after))
 
 
-def find_late(rows: SessionRows) -> LateSensor | None:
-    """The sensors whose lag, taken off, lets the rows be explained better; None where no lag does so."""
+def find_late(rows: SessionRows, without: Sequence[str] = ()) -> LateSensor | None:
+    """The sensors whose lag, taken off, lets the rows be explained better; None where no lag does so.
+
+    without: channels that no sensor reads.
+    """
     lags = Lags(rows, rows.segments)
-    places = lags.places()
+    places = {where: parts for where, parts in lags.places().items() if not concerns(where, without)}
     if not places:
         return None
     before = lags.left()

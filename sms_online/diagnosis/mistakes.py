@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sms_online.description.channels import drive_channels
+from sms_online.description.channels import concerns, drive_channels
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rough_fit import SMALLEST, RoughFit, RoughRows, stretches
@@ -93,12 +93,12 @@ class Corrected:
     system: System
 
 
-def find_mistakes(session: Estimator, segments: Sequence[Segment]) -> Corrected:
+def find_mistakes(session: Estimator, segments: Sequence[Segment], without: Sequence[str] = ()) -> Corrected:
     """Undo one mistake after the other while that explains the samples far better.
 
-    session: that of the system as described; segments: its samples.
+    session: that of the system as described; segments: its samples; without: channels that no sensor reads.
     """
-    search = _Search(session, stretches(session, segments))
+    search = _Search(session, stretches(session, segments), without)
     while len(search.found) < MOST and search.step():
         pass
     return Corrected(tuple(search.found), search.undo, search.system)
@@ -118,10 +118,11 @@ def wrong_clock(system: System, t: Array) -> Mistake | None:
 
 
 class _Search:
-    def __init__(self, session: Estimator, segments: Sequence[Segment]) -> None:
+    def __init__(self, session: Estimator, segments: Sequence[Segment], without: Sequence[str]) -> None:
         self.session, self.system = session, session.system
         self.found: list[Mistake] = []
         self._channels = session.sensing.channels
+        self._read = tuple(name for name in self._channels if name not in without)
         self._segments = list(segments)
         self._undone: list[MistakeHypothesis] = []
         self._drives = {i - 1: name for name, i in drive_channels(self.system).items()}
@@ -141,11 +142,12 @@ class _Search:
             return False
         if rows.for_each < LEAST_ROWS:
             return False  # so many parameters explain any samples
-        found = list(self._samples(shown(self._channels, self._segments), given, EXPLAINED, LEAST_SHOWN))
+        by_themselves = (each for each in shown(self._channels, self._segments) if concerns(each.where, self._read))
+        found = list(self._samples(by_themselves, given, EXPLAINED, LEAST_SHOWN))
         if not found:
             found = list(self._scaled(rows, freed))
             if _left(given, PHYSICS) > LEAST_RATIO:
-                every = (*mistake_hypotheses(self.system, self._channels), *_gravities(self.system))
+                every = (*mistake_hypotheses(self.system, self._read), *_gravities(self.system))
                 likely = self._likely(every)
                 found += self._samples(likely, given, PHYSICS, LEAST_RATIO)
         if not found:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from sms_online.calibration.found import Calibration
+from sms_online.description.schema import System
 from sms_online.diagnosis.attempt import Attempt, ModelFit, Step
 from sms_online.diagnosis.candidate import Finding, Ranked
 from sms_online.diagnosis.capture_changes import CaptureChange
@@ -36,6 +37,7 @@ class Search:
     estimator_before, estimator_after: sessions of the two systems over the whole capture; the first one again where the
     search is partial or parameters come from its own rows. drifts: parameters that drift, which the second follows;
     nothing else is searched then. changes: jumps of parameters in the capture; all else is of one part of it.
+    restored: the system with what was found as captures of it are recorded, where coordinates were reconstructed.
     """
 
     verdict: str
@@ -57,11 +59,22 @@ class Search:
     unexplained: Unexplained | None
     drifts: tuple[Drift, ...] = ()
     changes: tuple[CaptureChange, ...] = ()
+    restored: System | None = None
+
+    @property
+    def adopted(self) -> System:
+        """The described system with what was found."""
+        return self.after.system if self.restored is None else self.restored
 
     @property
     def left(self) -> float:
         """Share of what was beyond noise that is left with what was found."""
         return share_left(self.before.excess, self.after.excess)
+
+    @property
+    def of_reconstructed(self) -> bool:
+        """Whether parameters after are of coordinates that are reconstructed, and not of the samples themselves."""
+        return self.restored is not None and self.estimator_after.system != self.restored
 
     @cached_property
     def by_rows(self) -> bool:
@@ -69,6 +82,8 @@ class Search:
 
         Where nothing was found those of the session as described are, which knows more of its sensors' noise.
         """
+        if self.restored is not None and not self.of_reconstructed:
+            return False
         return (self.partial or self.attempt.by_rows(self.chosen)) and self.after.system != self.estimator_before.system
 
     @cached_property

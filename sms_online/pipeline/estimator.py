@@ -33,7 +33,7 @@ from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.pipeline.preparation import Preparation
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.relinearisation import Relinearisation
-from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, stated_period
+from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, not_smoothed, stated_period
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
 from sms_online.pipeline.tracker_bank import session_trackers
@@ -90,9 +90,8 @@ class Estimator(Stage):
         if distorted and self.sensing.missing and system.balance != "energy":
             found = f"{distorted[0].name}@{distorted[0].where}, and no {self.sensing.missing[0]}"
             raise InputError(source, "", found, 'balance = "energy", or all coordinates measured')
-        if system.wrenches and self._needs_smoother:
-            found = "a measured wrench, which the smoother does not use"
-            raise InputError(source, "", found, 'balance = "energy", or all coordinates measured fast enough')
+        if self._needs_smoother and (refused := not_smoothed(model)):
+            raise InputError(source, "", refused, 'balance = "energy", or all coordinates measured fast enough')
         if not distorted and self._needs_smoother:
             from sms_online.smoother.session import Smoother  # which few sessions need
 

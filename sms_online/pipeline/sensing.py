@@ -52,6 +52,14 @@ def is_slow(period: float, window: float) -> bool:
     return window < LEAST_IN_WINDOW * period
 
 
+def not_smoothed(model: Model) -> str:
+    """What a system has that the smoother does not use, in words; empty where it has nothing of the kind."""
+    if model.system.wrenches:
+        return "a measured wrench, which the smoother does not use"
+    inner = [effect.key for effect in model.effects if effect.n_states or effect.needs_torque]
+    return f"{inner[0]}, whose internal states the smoother does not follow" if inner else ""
+
+
 class Sensing:
     """Which of a source's channels give each coordinate and torque of a model.
 
@@ -232,6 +240,22 @@ class Sensing:
         """Numbers of the coordinates q_i that are read as an angle beyond θ_m_i, with those of θ_m_i."""
         first = len(self._base)
         return [(first + joint, first + len(self._q) + motor) for joint, motor in self._beyond]
+
+    @property
+    def unseen(self) -> list[int]:
+        """Positions, as numbers in x, of which a sensor is missing or too slow for windows of the momentum balance."""
+        layout = self.model.layout
+
+        def slow(columns: Sequence[int]) -> bool:
+            names = [self.channels[column] for column in columns]
+            return is_slow(stated_period(self.model.system, names), self.model.system.windows.momentum)
+
+        out = [k for k, column in enumerate([*self._base, *self._q, *self._theta_m]) if slow([column])]
+        for i, kinematics in enumerate(self.model.chain.flexible):
+            if kinematics is not None:
+                seen = i in self._links and self._links[i][0].complete and not slow(self._links[i][1])
+                out += [] if seen else range(layout.n_x)[layout.elastic(i)]
+        return out
 
     @property
     def n_rigid(self) -> int:

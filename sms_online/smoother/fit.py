@@ -36,6 +36,9 @@ LATER_LEVELS = (0.01, 0.001, 0.0)
 NEXT_LEVELS = (0.0,)
 # Level, and times the torques' noise, up to which no other start is tried: what a poor one leaves is far more.
 NEARLY_EXACT = (0.0, 3.0)
+# Those by which a motion follows the samples without a fit: tight enough to smooth their noise, loose enough for any
+# friction that nobody described.
+FOLLOWING = (0.3, 0.1)
 # Steps of the collocation, s, ever finer.
 STEPS = (0.005, 0.0025, 0.00125)
 
@@ -72,6 +75,24 @@ class SpanSmoother(SmoothedReadings):
             except NO_NUMBERS:
                 # Parameters are known, but not the motion, where cameras have not seen a link for a while.
                 return Search(self, span, beta, known).through(LEVELS, (last_step,))
+
+    def follow(self, span: Span, beta: Array, known: Array) -> Search:
+        """The search that has converged on a span, by the tightest of loose equations that the samples agree with.
+
+        Its factor holds what they say of nuisances, and of parameters what such equations determine. See `fit`; raises
+        DivergedError.
+        """
+        why = "no motion explains the samples, whatever forces act"
+        with _diverging():
+            for search in self._begun(span, beta, known):
+                with suppress(*NO_NUMBERS):
+                    for level in FOLLOWING:
+                        search.loosen(level)
+                    # Parameters move on, which loose equations hardly determine; the motion follows the samples anyway.
+                    if not self.m or search.converge(level, slice(self.m)):
+                        return search
+                    why = f"no motion explains the samples, after {search.iterations} steps"
+        raise DivergedError(why)
 
     def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
         """From the start that leads to equations that hold, or else to those that hold best."""

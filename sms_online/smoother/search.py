@@ -231,19 +231,19 @@ class Search:
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return
 
-    def converge(self, level: float) -> bool:
-        """Search until β converges or its steps scatter within its errors, in so many at most; whether it does."""
+    def converge(self, level: float, wanted: slice = slice(None)) -> bool:
+        """Search until β, or what is wanted of it, converges or steps scatter within its errors; whether it does."""
         self._held = False
         targets: list[Array] = []
         with suppress(*NO_NUMBERS):
             for _ in range(MAX_STEPS):
                 before = self.beta
                 self.advance(level, tame=False)
-                step = np.abs(self._asked)
-                if np.all(step <= CONVERGED * self.std):
+                step = np.abs(self._asked[wanted])
+                if np.all(step <= CONVERGED * self.std[wanted]):
                     return True
                 longest = LONGEST_STEP if self.mean_square <= LARGEST_MEAN_SQUARE else LONGEST_MISFIT
-                targets = [*targets, before + self._asked] if np.all(step <= longest * self.std) else []
+                targets = [*targets, before + self._asked] if np.all(step <= longest * self.std[wanted]) else []
         if len(targets) >= FEWEST_TARGETS:
             self.factor, self.beta = averaged(self.factor, targets[-FEWEST_TARGETS:])
             self.std = np.sqrt(np.diag(solve(triangular_factor(self._known, self.factor)).covariance()))

@@ -16,6 +16,7 @@ from sms_online.pipeline.noise import noise_std
 from sms_online.pipeline.sensing import Sensing, stated_noise
 from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
 from sms_online.pipeline.synchronise import GridSamples, Synchroniser
+from sms_online.smoother.first_motion import FirstMotion
 from sms_online.smoother.fit import SpanSmoother
 from sms_online.smoother.jackknife import SpanBlock, jackknife_covariance, with_span
 from sms_online.smoother.nuisances import ReadingNuisances
@@ -34,10 +35,6 @@ NEXT_SPAN = 1.0
 LATER_END = 5.0
 # A shorter one may not hold a motion.
 LEAST_SPAN = 0.5
-# A gap of the motion longer than this is filled, at this interval, s: 1 m/s moves the arm by a centimetre in it.
-HOLE, FILL = 0.015, 0.01
-# Samples within this time of an instant, s, say what a channel reads then.
-NEARBY = 0.05
 # Readings that scatter by this multiple of their stated noise hold more than that: a tenth more and no fit is taken.
 NOISIER = 1.05
 # No channel is better than this share of its largest reading: the collocation errs by as much.
@@ -144,6 +141,7 @@ class Smoother(Stage):
         self.prior: Prior | None = None
         self._synchroniser = Synchroniser([f"n_tau_{i}" for i in range(1, joints + 1)], self._rate)
         self._readings = ReadingNuisances(model, self.channels)
+        self._first_motion = FirstMotion(model, sensing, self.channels)
         tolerances = np.array([each.tolerance for each in self.nuisances])
         n = tolerances.size + base.n
         nothing = np.zeros((n + 1, n + 1)), np.full(n, np.nan)
@@ -250,9 +248,7 @@ class Smoother(Stage):
     def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> None:
         """Fit a span; once more where it does not agree with its samples, and these show more noise than is stated."""
         now = self.state
-        begin, end = self._time(now.index[[0, count - 1], 0])
-        inside = (now.t >= begin) & (now.t <= end)
-        t, values = now.t[inside], now.values[inside]
+        begin, end, t, values = self._samples(count)
         fit = self._fitted(count, t, values, first_fit)
         if self._doubtful(fit) and self._noisier(t, values):
             fit = self._fitted(count, t, values, first_fit)
@@ -263,6 +259,13 @@ class Smoother(Stage):
             failures = (*now.known.failures, f"{begin:.6g} … {end:.6g} s: {fit}")
             now.known, now.ending = now.known._replace(failures=failures), None
 
+    def _samples(self, count: int) -> tuple[float, float, Array, Array]:
+        """Begin and end of the span of `count` torques, s, and t (M,) and values (M, channels) of its readings."""
+        now = self.state
+        begin, end = self._time(now.index[[0, count - 1], 0]).tolist()
+        inside = (now.t >= begin) & (now.t <= end)
+        return begin, end, now.t[inside], now.values[inside]
+
     def _doubtful(self, fit: SpanFit | DivergedError) -> bool:
         if isinstance(fit, DivergedError):
             return True
@@ -272,7 +275,27 @@ class Smoother(Stage):
         self, count: int, t: Array, values: Array, first_fit: Callable[[], Estimate]
     ) -> SpanFit | DivergedError:
         """Fit of the first `count` torques and of readings (M, channels) at t (M,), s; or why there is none."""
-        now, past = self.state, self.known
+        past = self.known
+        try:
+            smoother, span = self._problem(count, t, values)
+            beta = past.beta if past.spans else self._beginning(first_fit)
+            last_step = past.last_step if past.spans else None
+            return smoother.fit(span, beta, self._beforehand, last_step, self.state.ending)
+        except DivergedError as error:
+            return error
+
+    @property
+    def _beforehand(self) -> Array:
+        """What is known of nuisances and parameters before a span, as a factor (m + n + 1, m + n + 1)."""
+        return triangular_factor(self.known.beforehand(self.prior), self.known.factor)
+
+    def _beginning(self, first_fit: Callable[[], Estimate]) -> Array:
+        """β (m + n,) that the first span begins with; DivergedError where it is no mechanism's."""
+        return np.concatenate((np.zeros(len(self.nuisances)), self._realisable(first_fit())))
+
+    def _problem(self, count: int, t: Array, values: Array) -> tuple[SpanSmoother, Span]:
+        """What fits a span, and the span: see `_fitted`. DivergedError where there is no motion to begin with."""
+        now = self.state
         torque_t = self._time(now.index[:count, 0])
         moved = (now.moved >= now.index[0, 0]) & (now.moved <= now.index[count - 1, 0])
         sigma, torque_density = self._noise(t, values, now.torque[:count])
@@ -280,54 +303,11 @@ class Smoother(Stage):
         readings = Readings(self._model, [self.channels[k] for k in sensed])
         noise = sigma[sensed], torque_density
         of_channels = self._readings, sensed.tolist()
-        smoother = SpanSmoother(self._model, self._base, readings, *noise, *of_channels, past.torque_noise)
+        smoother = SpanSmoother(self._model, self._base, readings, *noise, *of_channels, self.known.torque_noise)
         if not moved.any():
-            return DivergedError("the sensors give no motion to begin with")
-        guess = self._guess(self._time(now.moved[moved]), now.motion[moved], t, values)
-        span = Span(torque_t, now.torque[:count], t, values[:, sensed], *guess)
-        known = triangular_factor(past.beforehand(self.prior), past.factor)
-        try:
-            first = np.zeros(len(self.nuisances))
-            beta = past.beta if past.spans else np.concatenate((first, self._realisable(first_fit())))
-            return smoother.fit(span, beta, known, past.last_step if past.spans else None, now.ending)
-        except DivergedError as error:
-            return error
-
-    def _guess(self, t: Array, motion: Array, sampled: Array, values: Array) -> tuple[Array, Array, Array]:
-        """Instants, x and v of a motion with gaps, filled from those sensors that read something.
-
-        What they do not show, as the shape of a link that cameras do not see, goes straight through a gap.
-        t (B,), motion (B, n_x + n_v). sampled (M,), values (M, channels): of the readings.
-        """
-        layout = self._model.layout
-        known = np.concatenate((sampled[:1], t, sampled[-1:]))
-        fills = [np.arange(known[k] + FILL, known[k + 1], FILL) for k in np.flatnonzero(np.diff(known) > HOLE)]
-        filled = []
-        for fill in fills:
-            around = np.concatenate((fill[:1] - FILL, fill, fill[-1:] + FILL))
-            x = self._sensing.coordinates(self._read(around, sampled, values))
-            straight = np.stack([np.interp(around, t, column) for column in motion.T[: layout.n_x]], axis=1)
-            x = np.where(np.isfinite(x), x, straight)
-            v = layout.speeds(x, np.gradient(x, around, axis=0))
-            filled.append(np.concatenate((x, v), axis=1)[1:-1])
-        times = np.concatenate((t, *fills))
-        order = np.argsort(times, kind="stable")
-        whole = np.concatenate((motion, *filled))[order]
-        return times[order], whole[:, : layout.n_x], whole[:, layout.n_x :]
-
-    def _read(self, t: Array, sampled: Array, values: Array) -> Array:
-        """Readings (B, sensing's channels) at t (B,), s, between samples; NaN where there are none nearby."""
-        out = np.full((t.size, len(self._sensing.channels)), np.nan)
-        for column, name in enumerate(self._sensing.channels):
-            own = values[:, self.channels.index(name)] if name in self.channels else np.empty(0)
-            read = np.flatnonzero(np.isfinite(own))
-            if read.size:
-                at = sampled[read]
-                out[:, column] = np.interp(t, at, own[read])
-                after = np.searchsorted(at, t).clip(0, read.size - 1)
-                apart = np.minimum(np.abs(at[after] - t), np.abs(at[np.maximum(after - 1, 0)] - t))
-                out[apart > NEARBY, column] = np.nan
-        return out
+            raise DivergedError("the sensors give no motion to begin with")
+        guess = self._first_motion(self._time(now.moved[moved]), now.motion[moved], t, values)
+        return smoother, Span(torque_t, now.torque[:count], t, values[:, sensed], *guess)
 
     def _take(self, fit: SpanFit, end: float) -> None:
         past = self.state.known

@@ -76,7 +76,6 @@ class Evidence:
     still: whether the tracker that was asked for lets no parameter move.
     unwatched: s of a session in which no drift is watched for and none is followed; 0 elsewhere.
     consistency: of the judged tracker's rows with its error bars.
-    smoothed: whether the smoother gives the estimate, so that there are no rows to diagnose.
     scale: 1σ of the factor that all parameters have in common, where nothing else fixes it.
     """
 
@@ -108,5 +107,4 @@ class Evidence:
     still: bool = False
     unwatched: float = 0.0
     consistency: Consistency | None = None
-    smoothed: bool = False
     scale: float | None = None

@@ -16,7 +16,7 @@ from sms_online.pipeline.synchronise import SIDE
 from sms_online.row_types import NOISE_WHITENED
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
-from sms_online.verdict.reasons import DECLARE, MEASURE_SLOPES, unexplained_torques
+from sms_online.verdict.reasons import DIAGNOSE, MEASURE_SLOPES, STATE_HELD, unexplained_torques
 from sms_online.verdict.torque_noise import noisy_torques
 from sms_online.verdict.trust import Reason
 
@@ -64,7 +64,6 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         still=any(each.still for each in now.setup.system.trackers[:1]),
         unwatched=now.duration if now.method == "momentum" and momentum is not None and momentum.unwatched else 0.0,
         consistency=trackers[0].consistency if trackers else None,
-        smoothed=now.method == "smoother",
         scale=now.setup.system.scale_tolerance,
     )
 
@@ -140,7 +139,8 @@ def _weaknesses(now: Statistics) -> list[Reason]:
     if now.momentum is None and not by_smoother:
         out.append(Reason("by the energy balance alone, nothing tests whether the model lacks something", False))
     if now.smoother is not None and not by_smoother and now.setup.sensing.missing:
-        out.append(Reason("links are taken to bend quasi-statically: estimates are off by several percent", False))
+        text = "links are taken to bend quasi-statically: estimates are off by several percent"
+        out.append(Reason(text, False, then=DIAGNOSE))
     late = None if now.momentum is None else now.momentum.latency
     if late is not None:
         whose = late.source if late.size > 0.0 else f"all sources but {late.source}"
@@ -151,11 +151,11 @@ def _weaknesses(now: Statistics) -> list[Reason]:
 def _inexact(smoother: SmootherStatistics) -> list[Reason]:
     """What the smoother had to allow for. Nothing that acts there is white: it shifts parameters by more than that."""
     if smoother.level > 0.0:
-        return [Reason("samples do not agree with the equations of motion", True, then=DECLARE)]
+        return [Reason("samples do not agree with the equations of motion", True, then=STATE_HELD)]
     if smoother.torque_noise > 1.0:
         text = f"what acts beside the torques is {smoother.torque_noise:.0f} × their noise"
-        return [Reason(text, smoother.torque_noise > LARGEST_TORQUE_NOISE, then=DECLARE)]
+        return [Reason(text, smoother.torque_noise > LARGEST_TORQUE_NOISE, then=STATE_HELD)]
     if smoother.beyond == 1.0:
         return []
     text = f"innovations are {smoother.beyond:.2g} × their noise: forces on the joints do not quite follow their laws"
-    return [Reason(text, smoother.beyond > NOISE_WHITENED, then=DECLARE)]
+    return [Reason(text, smoother.beyond > NOISE_WHITENED, then=STATE_HELD)]

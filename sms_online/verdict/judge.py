@@ -23,14 +23,6 @@ def judge(evidence: Evidence) -> Trust:
     What has been shown to be wrong counts from when it is shown. Residuals of an estimate that has not converged show
     nothing: it was made of other, poorer rows.
     """
-    trust = _judged(evidence)
-    if not evidence.smoothed:
-        return trust
-    return replace(trust, grounds=tuple(reasons.without_diagnosis(each) for each in trust.grounds))
-
-
-def _judged(evidence: Evidence) -> Trust:
-    """See `judge`; what to do next may be a diagnosis."""
     if reasons.lacking(evidence.discrepancies) or reasons.unexplained_torques(evidence.residual):
         # What the model lacks looks like errors of calibration as well.
         evidence = replace(evidence, miscalibrated=())

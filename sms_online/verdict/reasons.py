@@ -44,11 +44,8 @@ CHECK_ROWS = f"check geometry, clocks and stated noise of the sensors in these r
 CHECK_SCALE = "check unit and gear of the torques, or weigh one part and state it under [known]"
 CHECK_PRIOR = "check that prior, and run `sms-online diagnose` for what the model lacks in these rows"
 CHECK_COLOUR = "look at what filters that sensor, or log its samples as they are"
-DECLARE = (
-    "declare friction of the joints and damping of the links, and state `hold` of held torques; "
-    "with slopes measured too, `sms-online diagnose` says which of them is missing"
-)
-MEASURE_SLOPES = "measure slopes of the links too: the momentum balance includes the tolerances"
+STATE_HELD = f"state `hold` of held torques{THEN_DIAGNOSE}"
+MEASURE_SLOPES = "measure slopes of the links too: the momentum balance then includes the tolerances"
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
 WEIGH = "check torque constants and gear ratios, or weigh one part and state it under [known]"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
@@ -151,14 +148,6 @@ def beyond_limit(residual: Residuals) -> list[Reason]:
     )
     mark = f"{noise:.0f} × noise"
     return [Reason(f"the residual of {worst} is {mark}", True, (worst,), mark, full, CHECK_ROWS)]
-
-
-def without_diagnosis(reason: Reason) -> Reason:
-    """The same with what to do where there are no rows to diagnose."""
-    if "sms-online diagnose" not in reason.then or DECLARE in reason.then:
-        return reason
-    checked = reason.then.removesuffix(THEN_DIAGNOSE)
-    return replace(reason, then=DECLARE if checked == reason.then else f"{checked}; else {DECLARE}")
 
 
 def or_short(found: Sequence[Reason], residual: Residuals) -> list[Reason]:

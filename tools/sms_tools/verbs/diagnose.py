@@ -102,7 +102,7 @@ def _watched(args: argparse.Namespace, system: System, found: Diagnosis, capture
     document = found.document()
     # What is to be seen has been found already: no diagnosis runs beside it.
     # Estimated anew: what was fitted to these samples is nothing known of them beforehand.
-    after = found.search.after.system
+    after = found.search.adopted
     estimator = Estimator(after, capture.channels, str(args.captures[0]), whole=True)
     estimates: dict[str, tuple[float, float]] = {}
     if (known := found.search.attempt.case.prior(estimator)) is not None:

@@ -1,0 +1,64 @@
+"""A diagnosis of captures as they were recorded, where coordinates may have to be reconstructed for its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from sms_online.description.schema import System
+from sms_online.diagnosis.attempt import SEARCHED, PriorOf, Progress
+from sms_online.diagnosis.captures import one_after_another
+from sms_online.diagnosis.diagnose import diagnose, run_through
+from sms_online.diagnosis.search import Search
+from sms_online.effects.build import build_model
+from sms_online.pipeline.estimator import Estimator
+from sms_online.pipeline.sensing import not_smoothed
+from sms_online.smoother.reconstruction import Reconstruction
+from sms_online.stream import Block
+
+
+def diagnose_recorded(
+    system: System,
+    runs: Sequence[Sequence[Block]],
+    holdout: Sequence[Block],
+    source: str,
+    prior: PriorOf,
+    progress: Progress,
+    stop: Callable[[], bool],
+    learned: bool,
+) -> tuple[Search, list[str]]:
+    """What was found, and warnings of what was reconstructed for it; see `diagnose`.
+
+    Where a sensor is missing or too slow, what is found by reconstructed coordinates is fitted to the samples
+    themselves by the smoother, if it can be.
+    """
+    reconstruction = Reconstruction(system, runs[0][0].channels, source)
+    if reconstruction.channels:
+        progress("reconstructing what no sensor follows", 0.0)
+    held = reconstruction(holdout) if holdout else []
+    first, *further = map(reconstruction, runs)
+    channels = reconstruction.channels
+    found = diagnose(reconstruction.system, first, source, prior, held, progress, stop, learned, further, channels)
+    if not channels:
+        return found, []
+    found = replace(found, restored=reconstruction.restored(found.after.system))
+    as_recorded = not (found.partial or found.mistakes or found.zeros or found.changes or found.drifts)
+    if as_recorded and not not_smoothed(build_model(found.adopted)):
+        progress("fitting the model with what was found", SEARCHED)
+        found = _smoothed(found, runs, source, prior)
+    return found, reconstruction.warnings
+
+
+def _smoothed(found: Search, runs: Sequence[Sequence[Block]], source: str, prior: PriorOf) -> Search:
+    """With parameters by the smoother where equations with what was found explain the samples.
+
+    Dry friction that holds a joint allows for no exact equations; rows of momentum know of it.
+    """
+    session = Estimator(found.adopted, runs[0][0].channels, source, whole=True)
+    run_through(session, one_after_another(runs), prior)
+    if session.smoother is None or not session.by_smoother or not session.smoother.known.exact:
+        return found
+    if found.verdict == "unexplained":
+        # Of samples that are explained nothing is unexplained, whatever errors reconstructed coordinates have.
+        found = replace(found, verdict="named" if found.findings else "clean", unexplained=None)
+    return replace(found, estimator_after=session)
