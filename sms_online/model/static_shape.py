@@ -86,6 +86,8 @@ class PointedShape:
         origin (B, 3), m, rotation (B, 3, 3): of the link's frame {i}. NaN where no marker is seen.
         """
         B, axes = len(readings), self._axes
+        if not B:
+            return np.empty((0, self._n_f))
         seen = np.zeros((B, readings.shape[1] // len(axes), 3))
         seen[..., axes] = readings.reshape(B, -1, len(axes))
         seen[..., axes] -= origin[:, None, axes]

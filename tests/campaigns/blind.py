@@ -4,12 +4,14 @@
     python -m tests.campaigns.blind struck RESULTS.jsonl --seeds 4
     python -m tests.campaigns.blind pairs RESULTS.jsonl --seeds 20
     python -m tests.campaigns.blind clean RESULTS.jsonl --seeds 100
+    python -m tests.campaigns.blind cameras RESULTS.jsonl --seeds 1
     python -m tests.campaigns.blind summary RESULTS.jsonl
 
 Place, size and shape constants of each effect are drawn by the seed: it is worth 2 to 20 % of the rms of the rows that
 it acts on, or of their peaks. The diagnosis sees a capture with noise of grade B and a description with other nominal
 values; what was drawn is compared afterwards. `struck` diagnoses the cases with the true effect, and those whose
-columns are within 10° of it, struck out of the catalogue; in those of `pairs` two effects act at once. Simulated
+columns are within 10° of it, struck out of the catalogue; in those of `pairs` two effects act at once; in those of
+`cameras` forces and payloads act on an arm whose links are seen as points. Simulated
 motions are kept, so that another search can be tried on them. Every case is a line of RESULTS.jsonl; a stopped campaign
 goes on where it was.
 """
@@ -25,8 +27,9 @@ from unittest.mock import patch
 
 import numpy as np
 
+import sms_online as sms
 from sms_adapters.system_file import load_system
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import Effect, System, Tolerances
 from sms_online.diagnosis.candidates import CandidateColumns
 from sms_online.diagnosis.diagnose import diagnose
 from sms_online.diagnosis.evidence import basis, free_of
@@ -41,8 +44,9 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Array, Block
 from sms_tools.archive.runner import Work
+from tests.camera_rig import seen_by_cameras
 from tests.campaigns.accuracy import flagged
-from tests.campaigns.blind_draws import CLEAN, GRADE, SYSTEM, drawn
+from tests.campaigns.blind_draws import CLEAN, GRADE, SYSTEM, TOLERANCE, drawn
 from tests.campaigns.results import Record, absolute, campaign, complete, summed
 from tests.campaigns.sessions import SLIGHT, disguised, exact_session, noisy_session, true_parameters
 from tests.sessions_of import session_of
@@ -99,6 +103,38 @@ def one_clean(folder: Path, grade: str, seed: int) -> Record:
     system = load_system(SYSTEM)
     block = noisy_session(system, exact_session(system, folder / CLEAN), grade, seed)
     return _summary(diagnose(disguised(system, factor=SLIGHT), [block], "case", lambda _: None))
+
+
+def cameras(args: argparse.Namespace) -> None:
+    """Append sessions of an arm that cameras see as points, with one force or payload, seed by seed."""
+    drawn(args.cache)
+    names = [name for name in args.names if ENTRIES[name].kind in ("force", "inertia")]
+    wanted = product(range(args.seeds), names)
+    tasks = [({"kind": "cameras", "seed": k, "name": name}, (args.cache, name, k)) for k, name in wanted]
+    complete(args, one_by_cameras, tasks)
+
+
+def one_by_cameras(folder: Path, name: str, seed: int) -> Record:
+    """The diagnosis of a session with one effect, of which points and encoders tell; default tolerances."""
+    system = seen_by_cameras(SYSTEM).model_copy(update={"tolerances": Tolerances()})
+    effect = drawn(folder).effect(name, seed)
+    acting = system.model_copy(update={"effects": (effect,)})
+    exact = exact_session(acting, folder / f"cameras-{name}-{seed}.npz", TOLERANCE)
+    start = process_time()
+    found = sms.diagnose(disguised(system), noisy_session(system, exact, None, seed))
+    first = found.effects[0] if found.effects else None
+    return {
+        "where": effect.where,
+        "true": effect.coefficients,
+        "verdict": found.verdict,
+        "found": [each.effect for each in found.effects],
+        "alike": [] if first is None else list(first.ambiguous_with),
+        "reported": {
+            each.effect: {n: (c.value, c.std) for n, c in each.coefficients.items()} for each in found.effects
+        },
+        "trust": str(found.trust),
+        "seconds": process_time() - start,
+    }
 
 
 def _summary(found: Search) -> Record:
@@ -243,6 +279,12 @@ def summary(records: list[Record]) -> str:
         named = [r for r in both if set(r["true"]) <= set(r["found"])]
         lines.append(f"{len(both)} pairs: both named {len(named)}")
         lines += [f"   {list(r['true'])} → {r['found']}" for r in both if r not in named]
+    seen = [r for r in records if r["kind"] == "cameras"]
+    if seen:
+        first = [r for r in seen if r["found"] and f"{r['name']}@{r['where']}" in (r["found"][0], *r["alike"])]
+        lines.append(f"{len(seen)} by cameras: the right one or its group first {len(first)}")
+        lines.append(f"   {np.median([r['seconds'] for r in seen]):.0f} s of one core in the median")
+        lines += [f"   {r['name']}@{r['where']}: {r['verdict']} {r['found']}" for r in seen if r not in first]
     cleans = [r for r in records if r["kind"] == "clean"]
     if cleans:
         lines.append(f"{len(cleans)} clean: {sum(r['verdict'] != 'clean' for r in cleans)} more than noise")
@@ -295,6 +337,7 @@ if __name__ == "__main__":
             "struck": lambda args: singles(args, "struck", one_struck),
             "pairs": pairs,
             "clean": clean,
+            "cameras": cameras,
             "summary": summed(summary),
         },
         seeds={"type": int, "default": 4},
