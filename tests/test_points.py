@@ -114,6 +114,11 @@ def test_a_static_shape_is_found_from_points_to_a_hundredth() -> None:
     values = plant.channel_values(np.zeros((1, 2)), x)
     found = sensing.coordinates(values[:, [plant.channels.index(name) for name in sensing.channels]])
     assert_allclose(found, x, atol=0.01 * np.abs(x[0, 7:]).max())
+    # A view may ask before there is any sample.
+    assert sensing.coordinates(values[:0, [plant.channels.index(name) for name in sensing.channels]]).shape == (
+        0,
+        x.size,
+    )
 
 
 def test_a_shape_far_from_straight_is_found_from_points() -> None:

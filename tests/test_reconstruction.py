@@ -9,7 +9,8 @@ import sms_online as sms
 from sms_adapters.system_file import load_system
 from sms_online.description.channels import channels, concerns
 from sms_online.description.parse import parse_system
-from sms_online.description.schema import Effect, System
+from sms_online.description.schema import Effect, Fitted, System
+from sms_online.diagnosis.document import ROUGH_BARS
 from sms_online.effects.build import build_model, declaring
 from sms_online.pipeline.sensing import Sensing
 from sms_online.smoother.reconstruction import Reconstruction
@@ -84,6 +85,20 @@ def test_a_slow_sensor_is_reconstructed_too() -> None:
     assert "theta_m_1" not in made.channels
 
 
+def test_laws_with_internal_states_do_not_keep_coordinates_from_being_reconstructed(
+    bench: System, rubbing: list[Block]
+) -> None:
+    """A smoother's session refuses them, in one line."""
+    rough = Effect(name="presliding_friction", where="joint_1", coefficients={"width": 0.002})
+    fitted = {"presliding_friction@joint_1.torque": Fitted(value=3.0, std=0.1)}
+    system = declaring(bench, [rough]).model_copy(update={"fitted": fitted})
+    made = Reconstruction(system, rubbing[0].channels, "test")
+    assert [effect.key for effect in made.system.effects] == [rough.key]
+    assert made(rubbing)
+    with pytest.raises(sms.InputError, match="presliding_friction@joint_1, whose internal states"):
+        sms.estimate(system, rubbing)
+
+
 def test_a_place_concerns_channels_by_name_and_pattern() -> None:
     assert concerns("q_1, link_1.*", ["link_1.marker_2.u_y"])
     assert not concerns("q_1, link_2.*", ["link_1.marker_2.u_y"])
@@ -102,6 +117,26 @@ def test_friction_is_found_on_a_link_seen_as_points(bench: System, rubbing: list
     # The system that is written is of the capture as it was recorded.
     assert found.system.links[0].points == bench.links[0].points
     assert found.system.sensors == bench.sensors
+
+
+@pytest.mark.slow
+def test_a_law_with_internal_states_is_found_by_reconstructed_coordinates(bench: System) -> None:
+    """No smoother follows it, so parameters are of these coordinates, and the verdict says so."""
+    law = Effect(name="presliding_friction", where="joint_1", coefficients={"torque": 3.0, "width": 0.004})
+    found = sms.diagnose(described(bench), recorded(bench, law))
+    assert [effect.effect for effect in found.effects] == [law.key]
+    values = {name: each.value for name, each in found.effects[0].coefficients.items()}
+    assert values == pytest.approx(law.coefficients, rel=0.02)
+    assert ROUGH_BARS in found.trust.reasons
+    assert found.trust.level == "doubt"
+
+
+@pytest.mark.slow
+def test_stamps_in_milliseconds_are_found_on_a_link_seen_as_points(bench: System) -> None:
+    late = [Block(1000.0 * block.t, block.channels, block.values) for block in recorded(bench)]
+    found = sms.diagnose(described(bench), late)
+    assert [mistake.name for mistake in found.mistakes] == ["clock_unit"]
+    assert not found.effects
 
 
 @pytest.mark.slow

@@ -188,8 +188,9 @@ def diagnose(
         if jump is not None:
             return _part_of(*rest, jump)
     grave = said == "clean" and now.trust.grave
-    # What is left unexplained takes such numbers anywhere.
-    calibration = () if said == "unexplained" and not noisy else _miscalibrated(now, noisy and not named)
+    # What is left unexplained takes such numbers anywhere, and so do errors of reconstructed coordinates.
+    anywhere = bool(reconstructed) or (said == "unexplained" and not noisy)
+    calibration = () if anywhere else _miscalibrated(now, noisy and not named)
     if (said == "clean" and (mistakes or calibration)) or (noisy and calibration):
         said = "named"
     unexplained = None

@@ -20,6 +20,7 @@ from sms_online.result import event_document, residual_document, result_of
 from sms_online.row_types import Residual
 from sms_online.threads import one_blas_thread
 from sms_online.verdict.evidence import Evidence
+from sms_online.verdict.gather import evidence_of
 from sms_online.verdict.judge import at_noise, judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
 from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, MEASURE_SLOPES, REPLAY_WHOLE, THEN_DIAGNOSE, undecided
@@ -49,6 +50,7 @@ def diagnosis_document(
     sessions = {"before": evaluated(diagnosis.estimator_before), "after": evaluated(diagnosis.estimator_after)}
     results = {name: result_of(session, truth).document() for name, session in sessions.items()}
     unexplained, given = diagnosis.unexplained, diagnosis.by_rows
+    apart = given or diagnosis.of_reconstructed
     return {
         "schema": SCHEMA,
         "verdict": diagnosis.verdict,
@@ -123,7 +125,7 @@ def diagnosis_document(
             *(zero.sentence for zero in diagnosis.zeros),
             *(change.sentence for change in diagnosis.changes),
             # Those of a session are of its parameters, which are not those reported where these come from rows.
-            *(_after(diagnosis, sessions["after"]).warnings if given else sessions["after"].warnings),
+            *(_after(diagnosis, sessions["after"]) if apart else sessions["after"]).warnings,
         ],
     }
 
@@ -131,12 +133,8 @@ def diagnosis_document(
 def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
     """May the parameters after be trusted? What to do next is no diagnosis: this is one."""
     trust = session.trust
-    if diagnosis.by_rows:
-        # Parameters come from the rows of the diagnosis then, see `posterior`.
-        known = [p.determined for p in posterior(diagnosis.attempt, diagnosis.chosen)]
-        trust = judge(Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit)))
-    if diagnosis.of_reconstructed:
-        trust = _of_reconstructed(trust, diagnosis.attempt.case.reconstructed)
+    if diagnosis.by_rows or diagnosis.of_reconstructed:
+        trust = judge(_evidence_after(diagnosis, session))
     steps = [
         reason.then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE).removeprefix(IF_NOTHING)
         for reason in trust.grounds
@@ -145,12 +143,15 @@ def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
     return replace(trust, grounds=tuple(replace(reason, then=step) for reason, step in grounds))
 
 
-def _of_reconstructed(trust: Trust, channels: Sequence[str]) -> Trust:
-    """The verdict on parameters that are of reconstructed coordinates: of these channels no sensor is to blame."""
-    grounds = () if trust.level == "trust" else trust.grounds
-    own = [each for each in grounds if not each.places or not set(each.places) <= set(channels)]
-    rough = Reason(ROUGH_BARS, False, then=MEASURE_SLOPES)
-    return Trust("not yet" if trust.level == "not yet" else "doubt", (*own, rough), trust.grave)
+def _evidence_after(diagnosis: Search, session: JudgedEvaluation) -> Evidence:
+    """Where parameters are of rows of the diagnosis, see `posterior`, or of coordinates that no sensor reads."""
+    rough = (Reason(ROUGH_BARS, False, then=MEASURE_SLOPES),) if diagnosis.of_reconstructed else ()
+    if diagnosis.by_rows:
+        known = [p.determined for p in posterior(diagnosis.attempt, diagnosis.chosen)]
+        return Evidence((sum(known), len(known)), residual=_part(diagnosis.after.fit), weaknesses=rough)
+    # What such coordinates seem to be off by, or lack, is no sensor's fault.
+    evidence = replace(evidence_of(session, (), ()), lost=0.0, jitters={}, coloured={}, miscalibrated=())
+    return replace(evidence, weaknesses=rough)
 
 
 def trust_of(diagnosis: Search, after: JudgedEvaluation | None = None) -> Trust:

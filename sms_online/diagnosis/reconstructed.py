@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from sms_online.description.schema import System
 from sms_online.diagnosis.attempt import SEARCHED, PriorOf, Progress
-from sms_online.diagnosis.captures import one_after_another
+from sms_online.diagnosis.captures import in_seconds, one_after_another
 from sms_online.diagnosis.diagnose import diagnose, run_through
+from sms_online.diagnosis.mistakes import Mistake, wrong_clock
 from sms_online.diagnosis.search import Search
 from sms_online.effects.build import build_model
 from sms_online.pipeline.estimator import Estimator
@@ -33,15 +36,21 @@ def diagnose_recorded(
     themselves by the smoother, if it can be.
     """
     reconstruction = Reconstruction(system, runs[0][0].channels, source)
-    if reconstruction.channels:
+    channels, mistakes = reconstruction.channels, tuple[Mistake, ...]()
+    if channels:
         progress("reconstructing what no sensor follows", 0.0)
+        clock = wrong_clock(system, np.concatenate([block.t for block in runs[0]]))
+        if clock is not None:
+            # No motion follows samples at such times.
+            runs, holdout = [in_seconds(run, clock.before) for run in runs], in_seconds(holdout, clock.before)
+            mistakes = (clock,)
     held = reconstruction(holdout) if holdout else []
     first, *further = map(reconstruction, runs)
-    channels = reconstruction.channels
     found = diagnose(reconstruction.system, first, source, prior, held, progress, stop, learned, further, channels)
     if not channels:
         return found, []
-    found = replace(found, restored=reconstruction.restored(found.after.system))
+    restored = reconstruction.restored(found.after.system)
+    found = replace(found, restored=restored, mistakes=(*mistakes, *found.mistakes))
     as_recorded = not (found.partial or found.mistakes or found.zeros or found.changes or found.drifts)
     if as_recorded and not not_smoothed(build_model(found.adopted)):
         progress("fitting the model with what was found", SEARCHED)

@@ -151,6 +151,8 @@ class Estimator(Stage):
         """See Stage."""
         self._setup = None
         self._synchroniser.resumed = self.end
+        if self.smoother is not None:
+            self.smoother.resume(self.end)
 
     @one_blas_thread()
     def set_prior(self, prior: Prior) -> None:

@@ -57,6 +57,16 @@ class _Follower(Smoother):
         self._found, self._factor = search.beta, triangular_factor(self._factor, search.factor)
 
 
+def _without(system: System, keys: Sequence[str]) -> System:
+    """The system without some effects and what it states of them: forces as any other that is missing."""
+    stated = {
+        name: {key: value for key, value in getattr(system, name).items() if key.rpartition(".")[0] not in keys}
+        for name in ("known", "priors", "fitted")
+    }
+    effects = tuple(effect for effect in system.effects if effect.key not in keys)
+    return system.model_copy(update={"effects": effects, **stated})
+
+
 class Reconstruction:
     """Reconstructs what the sensors of a system do not follow.
 
@@ -71,6 +81,7 @@ class Reconstruction:
         self.system, self.channels = system, tuple[str, ...]()
         self.failures: list[str] = []
         model = build_model(system)
+        self._followed = _without(system, [e.key for e in model.effects if e.n_states or e.needs_torque])
         unseen = [] if system.balance == "energy" else Sensing(model, available, source).unseen
         if not unseen:
             return
@@ -112,7 +123,7 @@ class Reconstruction:
         """
         if not self.channels:
             return list(blocks)
-        estimator = Estimator(self._described, self._available, self._source, whole=True)
+        estimator = Estimator(self._followed, self._available, self._source, whole=True)
         follower = _Follower(estimator.model, estimator.base, estimator.sensing, self._available)
         estimator.smoother = follower
         for block in blocks:

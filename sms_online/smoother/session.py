@@ -160,6 +160,10 @@ class Smoother(Stage):
         """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior = prior
 
+    def resume(self, end: float) -> None:
+        """Count nothing as lost from `end`, s, to the next sample: the session did not listen."""
+        self._synchroniser.resumed = end
+
     @property
     def nuisances(self) -> tuple[Nuisance, ...]:
         """What its readings may be off by."""
