@@ -14,6 +14,7 @@ from sms_online.diagnosis.diagnose import diagnose, run_through
 from sms_online.diagnosis.mistakes import Mistake, wrong_clock
 from sms_online.diagnosis.search import Search
 from sms_online.effects.build import build_model
+from sms_online.effects.catalogue import channel_effects
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensing import not_smoothed
 from sms_online.smoother.reconstruction import Reconstruction
@@ -52,7 +53,7 @@ def diagnose_recorded(
     restored = reconstruction.restored(found.after.system)
     found = replace(found, restored=restored, mistakes=(*mistakes, *found.mistakes))
     as_recorded = not (found.partial or found.mistakes or found.zeros or found.changes or found.drifts)
-    if as_recorded and not not_smoothed(build_model(found.adopted)):
+    if as_recorded and not not_smoothed(build_model(found.adopted)) and not channel_effects(found.adopted):
         progress("fitting the model with what was found", SEARCHED)
         found = _smoothed(found, runs, source, prior)
     return found, reconstruction.warnings

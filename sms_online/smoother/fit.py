@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 
-from sms_online.pipeline.description import described
+from sms_online.pipeline.description import LOOSE, described, near_rows
 from sms_online.smoother.search import (
     LARGEST_MEAN_SQUARE,
     NO_NUMBERS,
@@ -36,9 +36,10 @@ LATER_LEVELS = (0.01, 0.001, 0.0)
 NEXT_LEVELS = (0.0,)
 # Level, and times the torques' noise, up to which no other start is tried: what a poor one leaves is far more.
 NEARLY_EXACT = (0.0, 3.0)
-# Those by which a motion follows the samples without a fit: tight enough to smooth their noise, loose enough for any
-# friction that nobody described.
-FOLLOWING = (0.3, 0.1)
+# Those by which a motion follows the samples without a fit, whatever else acts: the lower one is, the smoother is the
+# motion. And how far parameters may be from the description then, as a share of it, 1σ: held, where they run away.
+FOLLOWING = (3.0, 1.0, 0.3, 0.1)
+NEAR, HELD = 0.5, 1e-4
 # Steps of the collocation, s, ever finer.
 STEPS = (0.005, 0.0025, 0.00125)
 
@@ -51,6 +52,23 @@ def _diverging() -> Iterator[None]:
             yield
     except NO_NUMBERS as error:
         raise DivergedError(str(error)) from None
+
+
+def _followed(search: Search) -> float:
+    """The lowest level of white forces by which a motion follows the samples; DivergedError where there is none."""
+    followed = None
+    for level in FOLLOWING:
+        before = search.beta, search.motion
+        with suppress(*NO_NUMBERS):
+            search.loosen(level)
+            if search.mean_square <= LARGEST_MEAN_SQUARE:
+                followed = level
+                continue
+        search.beta, search.motion = before
+        break
+    if followed is None:
+        raise DivergedError("no motion explains the samples, whatever forces act")
+    return followed
 
 
 class SpanSmoother(SmoothedReadings):
@@ -79,20 +97,18 @@ class SpanSmoother(SmoothedReadings):
     def follow(self, span: Span, beta: Array, known: Array) -> Search:
         """The search that has converged on a span, by the tightest of loose equations that the samples agree with.
 
-        Its factor holds what they say of nuisances, and of parameters what such equations determine. See `fit`; raises
-        DivergedError.
+        Its factor holds what samples say of nuisances; its β (n,) is near the description, or the description where
+        forces that the model lacks would lead parameters astray. See `fit`; raises DivergedError.
         """
-        why = "no motion explains the samples, whatever forces act"
-        with _diverging():
-            for search in self._begun(span, beta, known):
-                with suppress(*NO_NUMBERS):
-                    for level in FOLLOWING:
-                        search.loosen(level)
-                    # Parameters move on, which loose equations hardly determine; the motion follows the samples anyway.
-                    if not self.m or search.converge(level, slice(self.m)):
-                        return search
-                    why = f"no motion explains the samples, after {search.iterations} steps"
-        raise DivergedError(why)
+        value, size = described(self.model, self.base)
+        for near, start in ((NEAR, beta), (HELD, np.concatenate((beta[: self.m], value)))):
+            rows = near_rows(value, near / LOOSE * size, self.m)
+            with suppress(DivergedError), _diverging():
+                search = Search(self, span, start, np.concatenate((known, rows)))
+                level = _followed(search)
+                if not self.m or search.converge(level, slice(self.m), tame=True):
+                    return search
+        raise DivergedError("no motion explains the samples, whatever forces act")
 
     def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
         """From the start that leads to equations that hold, or else to those that hold best."""

@@ -15,16 +15,18 @@ from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import sensed_channels
 from sms_online.description.schema import Sensor, System, Tolerances
 from sms_online.effects.build import build_model
+from sms_online.effects.catalogue import ENTRIES
 from sms_online.errors import InputError
 from sms_online.linearised import Motion
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.model.readings import position_channels
+from sms_online.pipeline.description import described
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensing import Sensing
 from sms_online.smoother.search import DivergedError
 from sms_online.smoother.session import Smoother
-from sms_online.stream import Array, Block
+from sms_online.stream import Block
 from sms_online.trackers.factor import triangular_factor
 from sms_online.trackers.interface import Estimate
 
@@ -41,15 +43,14 @@ class _Follower(Smoother):
         super().__init__(model, base, sensing, available)
         self.motions: list[Motion] = []
         self.failures: list[str] = []
-        self._found: Array | None = None
+        self._found = np.concatenate((np.zeros(len(self.nuisances)), described(model, base)[0]))
         self._factor = self.known.factor
 
     def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> None:
         begin, end, t, values = self._samples(count)
         try:
             smoother, span = self._problem(count, t, values)
-            beta = self._beginning(first_fit) if self._found is None else self._found
-            search = smoother.follow(span, beta, triangular_factor(self._beforehand, self._factor))
+            search = smoother.follow(span, self._found, triangular_factor(self._beforehand, self._factor))
         except DivergedError as error:
             self.failures.append(f"{begin:.6g} … {end:.6g} s: {error}")
             return
@@ -58,7 +59,7 @@ class _Follower(Smoother):
 
 
 def _without(system: System, keys: Sequence[str]) -> System:
-    """The system without some effects and what it states of them: forces as any other that is missing."""
+    """The system without some effects and what it states of them: what the smoother does not use is missing to it."""
     stated = {
         name: {key: value for key, value in getattr(system, name).items() if key.rpartition(".")[0] not in keys}
         for name in ("known", "priors", "fitted")
@@ -81,7 +82,9 @@ class Reconstruction:
         self.system, self.channels = system, tuple[str, ...]()
         self.failures: list[str] = []
         model = build_model(system)
-        self._followed = _without(system, [e.key for e in model.effects if e.n_states or e.needs_torque])
+        unused = [effect.key for effect in model.effects if effect.n_states or effect.needs_torque]
+        unused += [effect.key for effect in system.effects if ENTRIES[effect.name].kind == "channel"]
+        self._followed = _without(system, unused)
         unseen = [] if system.balance == "energy" else Sensing(model, available, source).unseen
         if not unseen:
             return

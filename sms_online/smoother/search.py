@@ -231,14 +231,14 @@ class Search:
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return
 
-    def converge(self, level: float, wanted: slice = slice(None)) -> bool:
+    def converge(self, level: float, wanted: slice = slice(None), tame: bool = False) -> bool:
         """Search until β, or what is wanted of it, converges or steps scatter within its errors; whether it does."""
         self._held = False
         targets: list[Array] = []
         with suppress(*NO_NUMBERS):
             for _ in range(MAX_STEPS):
                 before = self.beta
-                self.advance(level, tame=False)
+                self.advance(level, tame)
                 step = np.abs(self._asked[wanted])
                 if np.all(step <= CONVERGED * self.std[wanted]):
                     return True
