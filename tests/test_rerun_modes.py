@@ -19,7 +19,8 @@ PATIENCE = 60.0  # s, of a loaded machine
 STAYS = "the view stays until Ctrl-C"
 ARGUMENTS = {
     "demo": ["--system", "moved.toml"],
-    "live": ["--system", "testbed.toml", "--duration", "6"],
+    # An arm takes up to 6 s to begin on a slow host, and without a sample there is nothing to view.
+    "live": ["--system", "testbed.toml", "--duration", "14"],
     "replay": ["run.csv", "--system", "moved.toml"],
     "diagnose": ["run.csv", "--system", "moved.toml"],
     "show": ["--system", "moved.toml"],
