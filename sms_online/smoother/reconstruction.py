@@ -74,7 +74,7 @@ class Reconstruction:
     available: channels of the captures; source: names them in messages. system: as described, but with a reading of
     every coordinate. channels: those of its readings that are reconstructed; none where nothing has to be. failures:
     spans that were left out and why, a sentence each.
-    Raises InputError as `Estimator` does, or where declared effects act on channels.
+    Raises InputError as `Sensing` and `Estimator` do.
     """
 
     def __init__(self, system: System, available: Sequence[str], source: str) -> None:
@@ -82,12 +82,12 @@ class Reconstruction:
         self.system, self.channels = system, tuple[str, ...]()
         self.failures: list[str] = []
         model = build_model(system)
-        unused = [effect.key for effect in model.effects if effect.n_states or effect.needs_torque]
-        unused += [effect.key for effect in system.effects if ENTRIES[effect.name].kind == "channel"]
-        self._followed = _without(system, unused)
         unseen = [] if system.balance == "energy" else Sensing(model, available, source).unseen
         if not unseen:
             return
+        unused = [effect.key for effect in model.effects if effect.n_states or effect.needs_torque]
+        unused += [effect.key for effect in system.effects if ENTRIES[effect.name].kind == "channel"]
+        self._followed = _without(system, unused)
         bent = {i for i, k in enumerate(model.chain.flexible) if k and model.layout.elastic(i).start in unseen}
         links = tuple(
             link.model_copy(update={"markers": ()}) if i in bent else link for i, link in enumerate(system.links)
