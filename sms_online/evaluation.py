@@ -220,20 +220,22 @@ class Evaluation:
     def estimates(self) -> tuple[tuple[Estimate, Array], ...]:
         """Of each chosen tracker, the judged one first, its estimate and 1σ (n,) as it is reported, see `std`.
 
-        The judged one alone where no momentum balance gives the estimate.
+        The judged one alone where the energy balance gives the estimate.
         """
-        momentum = self.statistics.momentum
-        others = () if self.statistics.method != "momentum" or momentum is None else momentum.trackers[1:]
+        others = self.statistics.readings[1:]
         return ((self.estimate, self.std), *((each.estimate, self._reported(each.estimate)) for each in others))
 
     @cached_property
     @one_blas_thread()
     def trackers(self) -> tuple[TrackerResult, ...]:
-        """Results of each chosen tracker, the judged one first; empty where no momentum balance gives the estimate."""
+        """Results of each chosen tracker, the judged one first; empty where the energy balance gives the estimate.
+
+        Empty for the smoother, too, where no other than its own least squares is chosen.
+        """
         now = self.statistics
-        if now.method != "momentum" or now.momentum is None:
+        readings = now.readings
+        if not readings and now.method != "momentum":
             return ()
-        readings = now.momentum.trackers
         if not readings:
             rate = rows_per_second(self.model.layout.n_v, self.model.system.windows.momentum)
             readings = (Reading(now.setup.trackers[0].label, self.estimate, self.estimate.rows / rate),)

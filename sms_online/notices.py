@@ -10,7 +10,7 @@ from sms_online.physical import Projection
 from sms_online.pipeline.statistics import Statistics
 
 if TYPE_CHECKING:
-    from sms_online.smoother.session import SmootherStatistics
+    from sms_online.smoother.statistics import SmootherStatistics
 
 # Effects of one cause that a warning names.
 NAMED = 4

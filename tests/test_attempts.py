@@ -143,6 +143,7 @@ def test_a_lag_is_found_where_the_spring_vanishes_without_it(coulomb: float) -> 
     assert found.after.parameters["joint_1.stiffness"].value == pytest.approx(K, rel=0.01)
 
 
+@pytest.mark.slow
 def test_rows_are_whitened_by_the_session_s_parameters_where_these_leave_noise() -> None:
     """A first fit without weights is attenuated further."""
     clean = attempt_of(bench(), session(None, 0.0), [])

@@ -101,7 +101,7 @@ def test_a_take_joins_the_drives_on_their_clock(bench: tuple[System, sms.Capture
     assert set(data.channels) == set(blocks[0].channels)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_base_is_a_rigid_body_and_drift_is_found(tmp_path: Path) -> None:
     system = named(seen_by_cameras("paper-planar"))
     data = sms.simulate(system)

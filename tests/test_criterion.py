@@ -192,7 +192,7 @@ def test_a_prior_that_is_wrong_is_said_to_be() -> None:
     assert any("off its prior" in reason for reason in judged(estimator).reasons)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_torque_with_friction_fixes_the_scale() -> None:
     """Where the gain of the other is wrong too: its rows, which say 1e10 times as much, then hold no scale."""
     lacking = [

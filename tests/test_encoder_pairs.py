@@ -14,6 +14,9 @@ SYSTEM = "paper-planar"  # springs that give way by a quarter of the motion
 GEAR = 50.0
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def capture() -> sms.Capture:
     return sms.simulate(SYSTEM, duration=3.0, grade="B", seed=1)

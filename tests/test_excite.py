@@ -65,6 +65,7 @@ def test_a_batch_is_what_its_motions_are_alone() -> None:
     np.testing.assert_allclose(both.x[1], alone.x[0], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_worst_bound_is_lower_within_the_described_extremes(designed: Excitation) -> None:
     assert designed.before is not None
     worst = [max(p.percent or 0.0 for p in bounds.parameters.values()) for bounds in (designed.before, designed.after)]

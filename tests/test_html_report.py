@@ -81,6 +81,7 @@ def test_nothing_is_fetched_from_elsewhere(page: str) -> None:
     assert not re.search(r"src=|(href=\"|url\()(?!#)|https?://|@import|<script", page)
 
 
+@pytest.mark.slow
 def test_every_drawing_is_well_formed(page: str) -> None:
     drawings = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
     assert len(drawings) >= 10
@@ -88,12 +89,14 @@ def test_every_drawing_is_well_formed(page: str) -> None:
         ElementTree.fromstring(drawing)
 
 
+@pytest.mark.slow
 def test_every_reference_within_the_page_has_one_target(page: str) -> None:
     names = re.findall(r' id="([^"]+)"', page)
     assert len(names) == len(set(names))
     assert set(re.findall(r'(?:href="|url\()#([\w.]+)', page)) == set(names)
 
 
+@pytest.mark.slow
 def test_every_parameter_and_warning_is_on_the_page(page: str, planar_block: Block) -> None:
     estimator = Estimator(load_system("paper-planar"), planar_block.channels, "test")
     for p in estimator.base.parameters:
@@ -101,6 +104,7 @@ def test_every_parameter_and_warning_is_on_the_page(page: str, planar_block: Blo
     assert "a warning with &lt;angle brackets&gt;" in page
 
 
+@pytest.mark.slow
 def test_a_nominal_value_is_beside_each_estimate(page: str, planar_block: Block) -> None:
     estimator = Estimator(load_system("paper-planar"), planar_block.channels, "test")
     nominal = estimator.base.values(estimator.model.nominal)
@@ -290,6 +294,7 @@ def test_what_is_determined_late_fills_its_axis() -> None:
     assert 0.2 <= lowest < 1.0
 
 
+@pytest.mark.slow
 def test_the_judgement_is_the_first_thing_on_the_page(page: str) -> None:
     assert page.index('class="judgement trust"') < page.index("<h1>")
     assert "Trust: 16 of 16 parameters determined" in page

@@ -92,7 +92,12 @@ def test_a_session_without_a_mistake_has_none() -> None:
     ("change", "key", "words"),
     [
         pytest.param(times(-1.0, "tau_2"), "torque_sign@tau_2", "is inverted", marks=pytest.mark.slow),
-        (times(50.0, "tau_1", "tau_2"), "joint_torque@tau_1, tau_2", "everything is 50 × its description"),
+        pytest.param(
+            times(50.0, "tau_1", "tau_2"),
+            "joint_torque@tau_1, tau_2",
+            "everything is 50 × its description",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(times(180.0 / np.pi, "q_2"), "degrees@q_2", "q_2 is in degrees", marks=pytest.mark.long),
         pytest.param(times(1e3, "r_S_x", "r_S_y"), "millimetres@r_S_*", "in mm in place of m", marks=pytest.mark.long),
         pytest.param(times(2.0, "q_2"), "counts@q_2", "reads twice the angle", marks=pytest.mark.long),
@@ -109,6 +114,7 @@ def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: st
     np.testing.assert_allclose(corrected.samples(block.channels, block.values), session(4).values, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "keys"), [(1e3, ["torque_unit@tau_1, tau_2"]), (1.0, [])])
 def test_the_unit_of_torques_shows_beside_friction(factor: float, keys: list[str]) -> None:
     """Undescribed friction of five times the torques: it explains most of them in any unit."""
@@ -138,7 +144,11 @@ def test_a_wrong_gear_is_corrected_in_the_system() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("true", "said"),
-    [((0.0, 0.0, 0.0), (0.0, -9.81, 0.0)), ((0.0, -9.81, 0.0), (0.0, 0.0, 0.0)), ((0.0, -9.81, 0.0), (0.0, 9.81, 0.0))],
+    [
+        ((0.0, 0.0, 0.0), (0.0, -9.81, 0.0)),
+        pytest.param((0.0, -9.81, 0.0), (0.0, 0.0, 0.0), marks=pytest.mark.long),
+        pytest.param((0.0, -9.81, 0.0), (0.0, 9.81, 0.0), marks=pytest.mark.long),
+    ],
 )
 def test_gravity_along_another_axis_is_named(true: tuple[float, ...], said: tuple[float, ...]) -> None:
     """None where the description has some, the reverse, and the planar example upside down."""
@@ -163,7 +173,7 @@ def test_a_wrong_torque_constant_is_no_wrong_gear() -> None:
     np.testing.assert_allclose(undone, session(4).values, rtol=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_passive_joint_has_no_torque_to_mistake() -> None:
     """6 s of the planar example with a second joint that nothing drives, grade B (seed 4)."""
     system = load_system("paper-planar")
@@ -260,8 +270,8 @@ def test_whole_turns_are_those_of_the_other_encoder() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("channel", ["q_2", "theta_m_2"])
-@pytest.mark.parametrize("seed", [0, 4])
+@pytest.mark.parametrize("channel", ["q_2", pytest.param("theta_m_2", marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.long)])
 def test_the_zero_of_one_encoder_is_not_the_others(channel: str, seed: int) -> None:
     """To first order they differ by their signs alone, and the wrong one by calibration that turns the axis."""
 

@@ -130,7 +130,7 @@ def part(block: Block, kept: NDArray[np.bool_]) -> Block:
     return Block(block.t[kept], block.channels, block.values[kept])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_updates_with_a_gap_behind_them_are_resumed() -> None:
     """A lag from 6 s on, cogging from 14 s on, no samples from 20 to 20.6 s; saved between, and after both."""
     lagged, cogged = distorted(LAG, begin=6.0, seconds=26.0), axis_block(cogging, 14.0, seconds=26.0)

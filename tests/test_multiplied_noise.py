@@ -149,7 +149,7 @@ def test_noise_of_a_torque_does_not_pull_its_gain() -> None:
     assert not bias.correction(np.array([True, True])).columns.any()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 def test_noise_of_a_torque_makes_no_gain(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     path = tmp_path_factory.mktemp("arm") / "arm.toml"

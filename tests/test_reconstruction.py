@@ -59,6 +59,7 @@ def test_shapes_of_links_seen_as_points_are_reconstructed(bench: System, rubbing
     assert not Sensing(build_model(made.system), made(rubbing)[0].channels, "test").missing
 
 
+@pytest.mark.slow
 def test_reconstructed_shapes_follow_what_nobody_described(bench: System, rubbing: list[Block]) -> None:
     """Friction of a fifth of the torque, and parameters up to 40 % off; points with 0.1 mm of noise at 125 Hz."""
     made = Reconstruction(described(bench), rubbing[0].channels, "test")

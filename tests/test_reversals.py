@@ -57,7 +57,7 @@ def moved(seed: int) -> tuple[Array, Array, Array]:
     return t[kept], torque[kept], np.array(angles)[kept]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_inertia_is_free_of_the_friction_that_turns_it_back() -> None:
     """Four sessions: errors are within their bars all together, none is four bars off, and the bars are small."""
     z = []

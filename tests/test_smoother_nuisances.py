@@ -53,7 +53,7 @@ def test_late_cameras_and_a_misplaced_marker_are_found(late: tuple[System, sms.C
     assert abs(stiffness.value - 400.0) < 4.0 * stiffness.std
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_exact_readings_do_not_hold_what_they_are_off_by(late: tuple[System, sms.Capture]) -> None:
     system, data = late
     result = sms.estimate(tolerant(system), data)

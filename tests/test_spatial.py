@@ -83,7 +83,7 @@ def test_seven_joint_arm_gives_what_the_motion_excites() -> None:
     assert (~identifiable(estimate.pi, std) | (error < 5.0 * std))[~excited].all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [2, 9])
 def test_seven_joints_raise_no_alarm(seed: int) -> None:
     """Weights of a first fit of few windows, and those that noise attenuates, would predict a third of the noise."""

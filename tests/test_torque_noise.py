@@ -34,6 +34,7 @@ def estimated(seed: int) -> sms.Result:
     return sms.estimate(parse_system(AXIS, "axis.toml"), coloured(seed))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3, 4))])
 def test_noise_that_samples_do_not_show_is_said(seed: int) -> None:
     result = estimated(seed)

@@ -37,6 +37,7 @@ def shifted(capture: sms.Capture, share: float) -> tuple[sms.Capture, float]:
     return replace(capture, values=values), offset
 
 
+@pytest.mark.slow
 def test_zeros_that_differ_are_taken_off(system: sms.System, captures: list[sms.Capture]) -> None:
     second, offset = shifted(captures[1], SECOND)
     third, offset_held_out = shifted(captures[2], HELD_OUT)
@@ -52,6 +53,7 @@ def test_zeros_that_differ_are_taken_off(system: sms.System, captures: list[sms.
     assert len([warning for warning in found.warnings if "tau_1 reads" in warning]) == len(zeros)
 
 
+@pytest.mark.slow
 def test_equal_zeros_are_left_alone(system: sms.System, captures: list[sms.Capture]) -> None:
     found = sms.diagnose(system, captures[:2], holdout=captures[2])
     assert found.document()["torque_zeros"] == []

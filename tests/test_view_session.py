@@ -88,6 +88,7 @@ def test_the_recordings_last_values_are_the_results(recorded: Path) -> None:
     assert seen == set(found)
 
 
+@pytest.mark.slow
 def test_the_recordings_timeline_is_complete(recorded: Path) -> None:
     rows = columns(recorded / "session.rrd", "/arm/tip")
     t = np.array([row["time"].total_seconds() for row in rows if row.get("Points3D:positions") is not None])
@@ -97,6 +98,7 @@ def test_the_recordings_timeline_is_complete(recorded: Path) -> None:
     assert t[-1] == pytest.approx(SECONDS)
 
 
+@pytest.mark.slow
 def test_rerun_verifies_the_recording(recorded: Path) -> None:
     rerun = Path(sys.executable).with_name("rerun")
     done = subprocess.run(
@@ -105,6 +107,7 @@ def test_rerun_verifies_the_recording(recorded: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_events_are_logged_when_they_happen(recorded: Path) -> None:
     rows = [row for row in columns(recorded / "session.rrd", "/log") if row.get("TextLog:text")]
     lines = [row["TextLog:text"][0].split(" s: ")[1] for row in rows]

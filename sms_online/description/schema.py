@@ -238,9 +238,18 @@ class TrackerChoice(Record):
         return f"kalman {', '.join(parts)}".strip()
 
     @property
+    def _drifts(self) -> set[Drift]:
+        return {self.drift} if isinstance(self.drift, str) else set(self.drift.values())
+
+    @property
     def learns(self) -> bool:
         """Whether it learns drifts of some parameters."""
-        return "learned" in ([self.drift] if isinstance(self.drift, str) else self.drift.values())
+        return "learned" in self._drifts
+
+    @property
+    def trends(self) -> bool:
+        """Whether some parameters have rates, stated or learned."""
+        return bool(self._drifts & {"trend", "learned"})
 
     @property
     def still(self) -> bool:

@@ -23,7 +23,7 @@ from sms_online.pipeline.event_hypotheses import (
 )
 from sms_online.pipeline.event_instant import event_instant
 from sms_online.pipeline.event_rows import CLOCK, LARGEST_SHIFT, AfterChange, EventRows
-from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, Event, Seen
+from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, Event, Seen, prior_behind
 from sms_online.pipeline.latency import wandering_clocks
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.momentum_windows import INSTANTS
@@ -33,7 +33,7 @@ from sms_online.pipeline.synchronise import GridSamples
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Indices
 from sms_online.trackers.information import Information
-from sms_online.trackers.interface import Prior, joined
+from sms_online.trackers.interface import Prior
 
 # Windows after the event that a decision takes, and where two hypotheses remain, or a gap comes.
 DECISION = 10
@@ -374,13 +374,8 @@ class Changes(Stage):
             self._extend()
 
     def prior(self, described: Prior) -> Prior:
-        """What is known beforehand of the current parameters: nothing of those that have jumped."""
-        more = np.full(self.base.n - described.value.size, np.nan)
-        whole = joined(described, Prior(more, more))
-        jumped = {name for event in self.state.events for name in event.parameters}
-        everything_jumped = any(event.kind == "unexplained" for event in self.state.events)
-        gone = np.array([everything_jumped or p.name in jumped for p in self.base.parameters], dtype=np.bool_)
-        return replace(whole, std=np.where(gone, np.nan, whole.std))
+        """What is known beforehand of the current parameters."""
+        return prior_behind(self.state.events, described, self.base.parameters)
 
     def _extend(self) -> None:
         """Model and base with the effects, and the parameters, that events have added."""

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from sms_online.description.schema import System
+from sms_online.description.schema import LEAST_SQUARES, System
 from sms_online.effects.build import build_model, refuse_unknown_masses
 from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
 from sms_online.pipeline.blocks import ENERGY_BLOCK, blocks
-from sms_online.pipeline.changes import ModelUpdate
+from sms_online.pipeline.changes import Changes, ModelUpdate
 from sms_online.pipeline.energy_estimate import EnergyEstimate
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.marker_identity import MarkerIdentity, Swap
@@ -36,7 +36,7 @@ from sms_online.pipeline.relinearisation import Relinearisation
 from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, not_smoothed, stated_period
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
-from sms_online.pipeline.tracker_bank import session_trackers
+from sms_online.pipeline.tracker_bank import Reading, session_trackers
 from sms_online.state import Stage, State
 from sms_online.stream import Array, Block
 from sms_online.threads import one_blas_thread
@@ -95,7 +95,10 @@ class Estimator(Stage):
         if not distorted and self._needs_smoother:
             from sms_online.smoother.session import Smoother  # which few sessions need
 
-            self.smoother = Smoother(model, base, self.sensing, channels)
+            # Beside a momentum balance, which finds changes sooner, it looks for none.
+            changed = self._begin_joints if self.sensing.missing or self._slow else None
+            trackers = system.trackers or (LEAST_SQUARES,)
+            self.smoother = Smoother(model, base, self.sensing, channels, trackers, changed)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]
         self._smoothed_columns = [self.channels.index(name) for name in self._smoothed_channels]
@@ -112,7 +115,7 @@ class Estimator(Stage):
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
         by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
         self.trackers = session_trackers(self.sensing, not by_energy)
-        if by_energy and not all(choice.static for choice in self.trackers):
+        if by_energy and self.smoother is None and not all(choice.static for choice in self.trackers):
             found = "a tracker of its own, and no momentum balance"
             raise InputError(system.name, "tracker", found, "rls without forgetting, or all coordinates measured")
         self._relinearisation = (
@@ -125,7 +128,7 @@ class Estimator(Stage):
         self._first_block, self._block = blocks(system, slowest, whole)
         self.finished = False  # no more samples come
         self.prior: Prior | None = None
-        self._setup: tuple[int, Setup] | None = None  # and the number of events that it is since
+        self._setup: tuple[tuple[int, Method], Setup] | None = None  # since so many events, by this method
         self.state = EstimatorState(np.empty(0), np.empty((0, len(self._columns))))
 
     @property
@@ -174,24 +177,35 @@ class Estimator(Stage):
         return tuple(name for name in self.sensing.unused if name not in self.channels)
 
     @property
+    def _changing(self) -> Changes | Smoother | None:
+        """What finds changes."""
+        return self.smoother if self.momentum is None else self.momentum.changes
+
+    @property
+    def _estimating(self) -> Changes | Smoother | None:
+        """What knows the parameters that are estimated now; None where these are the system's own."""
+        return None if self.method == "energy" else self._changing
+
+    @property
     def model(self) -> Model:
         """The system's model, with what events have added to it."""
-        return self._model if self.momentum is None else self.momentum.changes.model
+        return self._model if self._estimating is None else self._estimating.model
 
     @property
     def base(self) -> BaseParameters:
         """The parameters that are estimated: the system's own, and what events have added to them."""
-        return self._base if self.momentum is None else self.momentum.changes.base
+        return self._base if self._estimating is None else self._estimating.base
 
     @property
     def events(self) -> list[Event]:
         """Changes of the system while the session ran."""
-        return [] if self.momentum is None else self.momentum.changes.events
+        return [] if self._changing is None else self._changing.events
 
     def _begin_joints(self) -> None:
         """Residuals of the joints count since the last event, in the parameters that hold since then."""
         since = (self.events[-1].time - self.start_time) * self.system.sample_rate if self.events else 0.0
-        self.energy.begin_joints(self.model, self.base, self.sensing, int(np.ceil(since)))
+        sensing = None if self.momentum is None else self.sensing
+        self.energy.begin_joints(self.model, self.base, sensing, int(np.ceil(since)))
 
     @property
     def samples(self) -> int:
@@ -220,7 +234,8 @@ class Estimator(Stage):
     @property
     def by_smoother(self) -> bool:
         """Whether the estimate comes from the smoother, which holds as long as nothing changes."""
-        return self.smoother is not None and self.smoother.known.spans > 0 and not self.events
+        known = self.smoother is not None and self.smoother.known.spans > 0
+        return known and (self.momentum is None or not self.events)
 
     @property
     def by_momentum(self) -> bool:
@@ -228,6 +243,12 @@ class Estimator(Stage):
         if self.momentum is None or self.by_smoother:
             return False
         return self.momentum.started or self.system.balance == "momentum"
+
+    def readings(self, t: float) -> tuple[Reading, ...]:
+        """Readings of each chosen tracker at t, s, the judged one first; empty where that is least squares alone."""
+        if self.smoother is not None and self.by_smoother:
+            return self.smoother.readings()
+        return self.momentum.readings(t) if self.momentum is not None and self.by_momentum else ()
 
     @property
     def method(self) -> Method:
@@ -239,14 +260,16 @@ class Estimator(Stage):
     @property
     def setup(self) -> Setup:
         """What is estimated now: one object from one event to the next."""
-        if self._setup is None or self._setup[0] != len(self.events):
-            current = None if self.momentum is None else self.momentum.current_prior
+        instant = len(self.events), self.method
+        if self._setup is None or self._setup[0] != instant:
+            behind = self.smoother if self.momentum is None else self.momentum
+            current = self.prior if behind is None else behind.current_prior
             now = self.model, self.base, self._base
             nuisances = () if self.momentum is None else self.momentum.nuisances
             smoothed = () if self.smoother is None else self.smoother.nuisances
             channels, priors = (self.sensing, self.unused), (self.prior, current)
             setup = Setup(self.system, *now, *channels, *priors, nuisances, smoothed, self.trackers)
-            self._setup = len(self.events), setup
+            self._setup = instant, setup
         return self._setup[1]
 
     @property
@@ -319,7 +342,7 @@ class Estimator(Stage):
         block = self._attitude.continued(Block(t, self.sensing.channels, values[:, :own]))
         if self.smoother is not None:
             every = np.concatenate((block.values, values[:, own:]), axis=1)
-            self.smoother.push(t, self.sensing.joint_torque(block.values), every[:, self._smoothed_columns])
+            self.smoother.gathered.push(t, self.sensing.joint_torque(block.values), every[:, self._smoothed_columns])
         if self._relinearisation is not None:
             self._relinearisation.observe(block.t, block.values)
         for piece in self._synchroniser.push(block):
@@ -375,7 +398,7 @@ class Estimator(Stage):
         x, inputs = rates.values[:, :n_x], rates.values[:, n_x:]
         v = self.model.layout.speeds(x, rates.rates[:, :n_x])
         if self.smoother is not None:
-            self.smoother.move(rates.index, x, v)
+            self.smoother.gathered.move(rates.index, x, v)
         states = self._preparation.states(rates)
         for observer in self.observers:
             observer.motion(rates.index, rates.segment, x, v, inputs, states)

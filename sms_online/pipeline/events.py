@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from sms_online.model.parameters import Parameter
 from sms_online.pipeline.latency import WANDER
 from sms_online.pipeline.white_rows import WhiteRows
 from sms_online.pipeline.whitening import forward_solved
@@ -23,6 +24,7 @@ from sms_online.state import Stage, State
 from sms_online.stream import Array
 from sms_online.trackers.factor import extended
 from sms_online.trackers.information import Information
+from sms_online.trackers.interface import Prior, joined
 
 # Motion before the first test, s, and after an event before the next: it must have shown what the model lacks.
 WARM_UP = 4.0
@@ -52,8 +54,8 @@ class Event:
     time: s. kind: `payload`, `stiffness`, `damping`, `friction`, `offset` or `inertia`; `unexplained` where no jump
     explains what followed, so that the estimate began anew; `undecided` where the session ended too early to decide, so
     that the estimate is that of before; `effect` where one was added to the model. parameters: the names of
-    what jumped, with unit, size and std (1σ) of each jump in that unit. dropped_windows: windows of rows that reach
-    across the event and were left out.
+    what jumped, with unit, size and std (1σ) of each jump in that unit. dropped_windows: windows of rows, or spans of a
+    smoother, that reach across the event or may, and were left out.
     """
 
     time: float
@@ -63,6 +65,19 @@ class Event:
     sizes: tuple[float, ...]
     stds: tuple[float, ...]
     dropped_windows: int
+
+
+def prior_behind(events: Sequence[Event], described: Prior, parameters: Sequence[Parameter]) -> Prior:
+    """What is known beforehand of parameters (n,) behind events: nothing of those that have jumped, or been added.
+
+    described: of the system's own parameters, which come first.
+    """
+    more = np.full(len(parameters) - described.value.size, np.nan)
+    whole = joined(described, Prior(more, more))
+    jumped = {name for event in events for name in event.parameters}
+    everything_jumped = any(event.kind == "unexplained" for event in events)
+    gone = np.array([everything_jumped or p.name in jumped for p in parameters], dtype=np.bool_)
+    return replace(whole, std=np.where(gone, np.nan, whole.std))
 
 
 @dataclass(frozen=True)

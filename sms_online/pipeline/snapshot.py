@@ -31,19 +31,19 @@ def statistics_of(estimator: Estimator, at: float | None = None) -> Statistics:
         last_time=estimator.last_time,
         periods=estimator.periods.copy(),
         events=tuple(estimator.events),
+        readings=estimator.readings(estimator.end if at is None else at),
         energy=snapshot(estimator.energy.tracker),
         shared=state_copy(estimator.energy.shared),
         joints=tuple(state_copy(estimator.energy.joint_residuals)),
-        momentum=None if momentum is None else _of_momentum(momentum, estimator.end if at is None else at),
+        momentum=None if momentum is None else _of_momentum(momentum),
         smoother=None if smoother is None else smoother.known,
     )
 
 
-def _of_momentum(momentum: Momentum, t: float) -> MomentumStatistics:
-    """The same of a momentum balance. t: of the newest sample, s."""
+def _of_momentum(momentum: Momentum) -> MomentumStatistics:
+    """The same of a momentum balance."""
     alarm, noise = momentum.test.alarm, momentum.sensor_noise
     return MomentumStatistics(
-        trackers=momentum.readings(t),
         reference=momentum.reference,
         tracker=snapshot(momentum.joint.tracker),
         bias=state_copy(momentum.joint.bias),

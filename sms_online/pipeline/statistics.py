@@ -33,7 +33,7 @@ from sms_online.threads import one_blas_thread
 from sms_online.trackers.interface import Estimate, Prior, Tracker
 
 if TYPE_CHECKING:
-    from sms_online.smoother.session import SmootherStatistics
+    from sms_online.smoother.statistics import SmootherStatistics
 
 # What the estimate comes from.
 Method = Literal["smoother", "momentum", "energy"]
@@ -81,8 +81,7 @@ def _setup(packed: bytes) -> Setup:
 class MomentumStatistics:
     """Statistics of the momentum balance.
 
-    trackers: what each chosen tracker says, the judged one first; empty where that is the session's own least squares
-    alone. reference: nuisances and parameters of the rows without what the judged tracker knows of a drift, None where
+    reference: nuisances and parameters of the rows without what the judged tracker knows of a drift, None where
     nothing has moved. tracker: its rows so far; bias: what noise in its columns does. rows: unwhitened rows and their
     misfit. started: weights are known. tested: there are rows enough for a test of what they leave. alarm: type of the
     rows that the sequential test finds more than noise in. passing: of types of joints' rows whose residual does not
@@ -93,7 +92,6 @@ class MomentumStatistics:
     are corrected by.
     """
 
-    trackers: tuple[Reading, ...]
     reference: Array | None
     tracker: Tracker
     bias: NoiseBias
@@ -118,7 +116,8 @@ class Statistics:
     """Sufficient statistics, counts and events of a session up to now.
 
     finished: no more samples come. outliers: by channel, samples that were left out. last_time (channels,): of each
-    one's last sample, s, -inf where none has come. periods (channels,): s a sample, NaN where unknown. energy: the
+    one's last sample, s, -inf where none has come. readings: what each chosen tracker says, the judged one first; empty
+    where that is the session's own least squares alone. periods (channels,): s a sample, NaN where unknown. energy: the
     energy balance's tracker; shared: what errors that its rows share do. joints: sums behind the relative residual of
     each.
     """
@@ -135,6 +134,7 @@ class Statistics:
     last_time: Array
     periods: Array
     events: tuple[Event, ...]
+    readings: tuple[Reading, ...]
     energy: Tracker
     shared: SharedErrors
     joints: tuple[SquaredResidual, ...]
@@ -145,14 +145,14 @@ class Statistics:
     def estimate(self) -> Estimate:
         """The base parameters, the same bits as from the estimator itself; takes milliseconds."""
         setup = self.setup
+        if self.readings:
+            return self.readings[0].estimate
         if self.method == "smoother":
             assert self.smoother is not None
             return self.smoother.estimate(setup.prior)
         if self.method == "energy":
             return self.energy_estimate()
         assert self.momentum is not None
-        if not setup.trackers[0].static:
-            return self.momentum.trackers[0].estimate
         rows, scale_free = self.momentum.tracker.estimate(), self.momentum.scale_free
         joint = unbiased(rows, self.momentum.bias, setup.nuisances) if scale_free is None else scale_free.estimate(rows)
         return joint.without_nuisances(len(setup.nuisances))

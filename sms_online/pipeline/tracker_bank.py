@@ -32,6 +32,8 @@ LOOKED, LED_OFF = 1.0, 0.3
 # Times behind an alarm, s, before which a drift may yet show where the judged tracker learns them, and where it is
 # unclear till then whether it was one.
 WAITED, LONGEST_WAITED = 4.4, 6.5
+# From one look whether rows determine all to the next: rows for each parameter.
+ROWS_A_PARAMETER = 20
 
 
 def session_trackers(sensing: Sensing, momentum: bool) -> tuple[TrackerChoice, ...]:
@@ -130,7 +132,8 @@ class TrackerBank(Stage):
         self._weighted = prior is not None
         self._rows_per_second = rows_per_second(rows_a_window, span)
         rate = self._rows_per_second
-        tracked = Tracked(parameters, tolerance.size, known, prior is not None, rate, name)
+        look = ROWS_A_PARAMETER * (tolerance.size + len(parameters))
+        tracked = Tracked(parameters, tolerance.size, known, prior is not None, rate, name, look)
         self._chosen = [
             _Chosen(choice, None if choice.static and trackers[0].static else build_tracker(choice, tracked))
             for choice in trackers

@@ -45,7 +45,7 @@ STEPS = (0.005, 0.0025, 0.00125)
 
 
 @contextmanager
-def _diverging() -> Iterator[None]:
+def diverging() -> Iterator[None]:
     """Whatever a search ends in that runs away is a DivergedError."""
     try:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
@@ -75,22 +75,27 @@ class SpanSmoother(SmoothedReadings):
     """Fits spans of one session."""
 
     def fit(
-        self, span: Span, beta: Array, known: Array, last_step: float | None, before: Ending | None = None
-    ) -> SpanFit:
+        self, span: Span, beta: Array, known: Array, last_step: float | None, before: Ending | None = None,
+        exactly: bool = False,
+    ) -> SpanFit:  # fmt: skip
         """Fit a span from β (n,), with what is known before it as a factor or rows (·, n + 1).
 
         last_step: of the collocation of an earlier span, s; None in the first one. before: of the span that this one
-        goes on from. Raises DivergedError.
+        goes on from. Raises DivergedError; exactly: also where a span that is not the first does not agree with the
+        equations of motion.
         """
-        with _diverging():
+        with diverging():
             if last_step is None:
                 return self._first(span, beta, known)
             if before is not None:
                 with suppress(*NO_NUMBERS):
-                    return Search(self, span, beta, known, before=before).through(NEXT_LEVELS, (last_step,))
+                    search = Search(self, span, beta, known, before=before)
+                    return search.through(NEXT_LEVELS, (last_step,), exactly)
             try:
-                return Search(self, span, beta, known).through(LATER_LEVELS, (last_step,))
+                return Search(self, span, beta, known).through(LATER_LEVELS, (last_step,), exactly)
             except NO_NUMBERS:
+                if exactly:
+                    raise
                 # Parameters are known, but not the motion, where cameras have not seen a link for a while.
                 return Search(self, span, beta, known).through(LEVELS, (last_step,))
 
@@ -103,7 +108,7 @@ class SpanSmoother(SmoothedReadings):
         value, size = described(self.model, self.base)
         for near, start in ((NEAR, beta), (HELD, np.concatenate((beta[: self.m], value)))):
             rows = near_rows(value, near / LOOSE * size, self.m)
-            with suppress(DivergedError), _diverging():
+            with suppress(DivergedError), diverging():
                 search = Search(self, span, start, np.concatenate((known, rows)))
                 level = _followed(search)
                 if not self.m or search.converge(level, slice(self.m), tame=True):

@@ -13,7 +13,7 @@ import numpy as np
 
 from sms_online.description.bodies import FlexibleLink
 from sms_online.description.channels import sensed_channels
-from sms_online.description.schema import Sensor, System, Tolerances
+from sms_online.description.schema import LEAST_SQUARES, Sensor, System, Tolerances
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import ENTRIES
 from sms_online.errors import InputError
@@ -40,22 +40,23 @@ class _Follower(Smoother):
     """Follows the samples span by span in place of fitting them. motions: of the spans; failures: of those left out."""
 
     def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, available: Sequence[str]) -> None:
-        super().__init__(model, base, sensing, available)
+        super().__init__(model, base, sensing, available, (LEAST_SQUARES,), None)
         self.motions: list[Motion] = []
         self.failures: list[str] = []
         self._found = np.concatenate((np.zeros(len(self.nuisances)), described(model, base)[0]))
         self._factor = self.known.factor
 
-    def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> None:
-        begin, end, t, values = self._samples(count)
+    def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> bool:
         try:
-            smoother, span = self._problem(count, t, values)
+            smoother, span = self._span_problem(count)
             search = smoother.follow(span, self._found, triangular_factor(self._beforehand, self._factor))
         except DivergedError as error:
+            begin, end, _, _ = self.gathered.span(count)
             self.failures.append(f"{begin:.6g} … {end:.6g} s: {error}")
-            return
+            return True
         self.motions.append(search.motion)
         self._found, self._factor = search.beta, triangular_factor(self._factor, search.factor)
+        return True
 
 
 def _without(system: System, keys: Sequence[str]) -> System:

@@ -62,6 +62,8 @@ LARGEST_MISFIT = 4.0
 RANK_TOLERANCE = 1e-8
 # A step of the search is halved so often, where β is no mechanism's after it.
 MOST_HALVINGS = 6
+# Deviation of β from where it is held, as a share of it, or in its unit where it is small.
+HELD = 1e-9
 # Mass matrices are checked that often along the motion, s.
 MASS_INTERVAL = 0.1
 # Steps that swing about the answer are shortened to this share of their length at least.
@@ -154,6 +156,8 @@ class Search:
         self.iterations = 0
         # Whether nuisances stay where they are, and with them, where a span goes on from another, the parameters.
         self._held = False
+        # Whether all of β does.
+        self._fixed = False
         self.beta = beta
         self.std, self.factor = np.full(beta.size, np.inf), np.zeros((beta.size + 1, beta.size + 1))
         self.mean_square = np.inf
@@ -183,14 +187,20 @@ class Search:
         self.motion = Motion(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
         self._use_nodes()
 
-    def through(self, levels: Sequence[float], steps: Sequence[float]) -> SpanFit:
-        """The fit, by way of white forces of so many levels."""
+    def hold(self, beta: Array) -> None:
+        """Go on with β (n,), or with what is near it and a mechanism's, and leave it there."""
+        self.beta, self._fixed = self._with_mass(beta), True
+        unit = HELD * np.maximum(np.abs(self.beta), 1.0)
+        self._known = np.column_stack((np.diag(1.0 / unit), self.beta / unit))
+
+    def through(self, levels: Sequence[float], steps: Sequence[float], exactly: bool = False) -> SpanFit:
+        """The fit, by way of white forces of so many levels; see `tightened`."""
         for level in levels:
             self.loosen(level)
-        return self.tightened(steps)
+        return self.tightened(steps, exactly)
 
-    def tightened(self, steps: Sequence[float]) -> SpanFit:
-        """The fit with equations that hold, or that hold as well as the samples allow."""
+    def tightened(self, steps: Sequence[float], exactly: bool = False) -> SpanFit:
+        """The fit with equations that hold, or that hold as well as the samples allow: not if they are to `exactly`."""
         for k, step in enumerate(steps):
             self.refine(step)
             before = self.beta, self.motion
@@ -200,6 +210,8 @@ class Search:
                 break
         if self.mean_square <= LARGEST_MISFIT:
             return self._taken(0.0, step)
+        if exactly:
+            raise DivergedError("samples do not agree with the equations of motion")
         least, near = self._torque_noise, None
         for self._torque_noise in (times for times in TORQUE_NOISE if times > least):
             if not np.isfinite(self.mean_square):
@@ -290,7 +302,7 @@ class Search:
             # From a motion that is roughly guessed a step would take what is known of the parameters far away.
             delta = np.zeros_like(delta)
         self._relax(delta)
-        beta = self._admissible(self.beta + self._relaxation * delta, solution, level > 0.0)
+        beta = self._admissible(self.beta + self._relaxation * delta, solution, level > 0.0 and not self._fixed)
         self._asked, delta = delta, beta - self.beta
         self.mean_square = float(np.mean((innovations[:, 0] - Y @ delta) ** 2))
         self.std = np.sqrt(np.diag(solution.covariance()))
@@ -370,6 +382,10 @@ class Search:
                 m = self._smoother.m
                 found = self._smoother.physical.project(beta[m:], solution.covariance()[m:, m:])
                 beta = np.concatenate((beta[:m], found.beta))
+        return self._with_mass(beta)
+
+    def _with_mass(self, beta: Array) -> Array:
+        """β (n,), or as much of the step there as leaves a mechanism."""
         for _ in range(MOST_HALVINGS):
             if self._has_mass(beta):
                 return beta

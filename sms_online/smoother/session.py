@@ -3,171 +3,138 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from sms_online.calibration.nuisance import Nuisance
+from sms_online.description.schema import TrackerChoice
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
-from sms_online.model.readings import Readings, readable_channels
+from sms_online.model.readings import readable_channels
 from sms_online.physical import PhysicalSet
-from sms_online.pipeline.noise import noise_std
-from sms_online.pipeline.sensing import Sensing, stated_noise
-from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES, SAMPLES
-from sms_online.pipeline.synchronise import GridSamples, Synchroniser
-from sms_online.smoother.first_motion import FirstMotion
+from sms_online.pipeline.events import Event, prior_behind
+from sms_online.pipeline.sensing import Sensing
+from sms_online.pipeline.sensor_noise import FEWEST_SAMPLES
+from sms_online.pipeline.tracker_bank import Reading
+from sms_online.smoother.changes import SpanChanges, Step, contradicts
 from sms_online.smoother.fit import SpanSmoother
-from sms_online.smoother.jackknife import SpanBlock, jackknife_covariance, with_span
-from sms_online.smoother.nuisances import ReadingNuisances
+from sms_online.smoother.gatherer import Gatherer
+from sms_online.smoother.noise import SpanNoise
+from sms_online.smoother.problem import SpanProblem
 from sms_online.smoother.search import LARGEST_MEAN_SQUARE, DivergedError, SpanFit
 from sms_online.smoother.span import Ending, Span
+from sms_online.smoother.statistics import SmootherStatistics
+from sms_online.smoother.tracking import SpanTrackers
 from sms_online.state import Stage, State
-from sms_online.stream import Array, Block, Indices
-from sms_online.trackers.factor import solve, triangular_factor
-from sms_online.trackers.interface import Estimate, Prior, prior_factor
+from sms_online.stream import Array
+from sms_online.trackers.factor import triangular_factor
+from sms_online.trackers.information import Information
+from sms_online.trackers.interface import Estimate, Prior
 
 # Length of the first span, and of one behind a gap, s: long enough to determine the parameters from a poor first fit.
 SPAN = 10.0
 # Of one that goes on from the last, whose state it knows: nothing is lost where spans meet, and nobody waits longer.
 NEXT_SPAN = 1.0
-# Where a gap of the motion is at its end, it goes on to the end of the gap, at most for this time, s.
-LATER_END = 5.0
 # A shorter one may not hold a motion.
 LEAST_SPAN = 0.5
-# Readings that scatter by this multiple of their stated noise hold more than that: a tenth more and no fit is taken.
-NOISIER = 1.05
-# No channel is better than this share of its largest reading: the collocation errs by as much.
-FINEST = 1e-6
-
-
-class SmootherStatistics(NamedTuple):
-    """What the spans so far have determined; nothing in it changes as the session goes on.
-
-    failures: spans that were left out and why, a sentence each. spans, rows: how many were taken. mean_square, level,
-    torque_noise: the largest of all, see `SpanFit`. factor (m + n + 1, m + n + 1): square-root information about
-    beta (m + n,), nuisances and parameters; tolerances (m,): of the nuisances.
-    last_step: of the last fit. end: time of the newest sample, s. lost: samples without a torque. noisier:
-    channels whose samples show more noise than is stated, and how many times as much, where no fit is taken otherwise.
-    blocks: of spans, in order of time. scatter (m + n, m + n): covariance of β by what these scatter by, where samples
-    do not agree with the equations and there are blocks enough.
-    """
-
-    failures: tuple[str, ...]
-    spans: int
-    level: float
-    mean_square: float
-    factor: Array
-    beta: Array
-    rows: int
-    rss: float
-    last_step: float
-    end: float
-    lost: int
-    tolerances: Array
-    torque_noise: float = 1.0
-    noisier: tuple[tuple[str, float], ...] = ()
-    blocks: tuple[SpanBlock, ...] = ()
-    scatter: Array | None = None
-
-    @property
-    def exact(self) -> bool:
-        """Whether samples agree with the equations of motion, and nothing had to be allowed for."""
-        return self.beyond == 1.0 and self.torque_noise == 1.0 and self.level == 0.0
-
-    @property
-    def beyond(self) -> float:
-        """The innovations' standard deviation over that of their noise, of the worst span; 1 where that is noise."""
-        return float(np.sqrt(self.mean_square)) if self.mean_square > LARGEST_MEAN_SQUARE else 1.0
-
-    def beforehand(self, prior: Prior | None) -> Array:
-        """What is known of nuisances and parameters beforehand, as rows (·, m + n + 1)."""
-        m, n = self.tolerances.size, self.beta.size - self.tolerances.size
-        known = prior_factor(prior, n)
-        within = np.zeros((m, m + n + 1))
-        within[:, :m] = np.diag(1.0 / self.tolerances)
-        return np.concatenate((within, np.concatenate((np.zeros((len(known), m)), known), axis=1)))
-
-    def estimate(self, prior: Prior | None) -> Estimate:
-        """The base parameters, with what is known of them beforehand; only after the first span."""
-        n = self.beta.size
-        problem = triangular_factor(self.beforehand(prior), self.factor)
-        problem[:, n] -= problem[:, :n] @ self.beta
-        solution = solve(problem)
-        estimate = Estimate(
-            pi=self.beta.copy(),
-            covariance=solution.covariance(),
-            covariance_robust=self.scatter,
-            determined=solution.determined,
-            condition_number=solution.condition_number,
-            rows=float(self.rows),
-            rss=self.rss,
-            dof=max(float(self.rows - solution.rank), 0.0),
-        )
-        return estimate.without_nuisances(self.tolerances.size)
+# Of the span behind a change, s, and where that does not show what it was.
+BEHIND, LONGEST_BEHIND = 3.0, 6.0
+# Spans that are left out for a change: the one that shows it, and the one before, which it may have disturbed.
+LEFT_OUT = 2
+# Where parameters may move, a span is fitted beside what is known of them with deviations that are so many times as
+# large: its rows do not depend on that, but what its samples leave would be larger than noise.
+LOOSER = 10.0
 
 
 class SmootherState(State):
-    """What a smoother keeps of the spans so far and to come.
+    """What a smoother keeps of the spans so far.
 
-    known: from the spans so far. values (B, channels): readings at t (B,), s. torque (K, joints): at index (K, 2), grid
-    index and segment. motion (M, n_x + n_v): as the pipeline took it from the sensors, at grid indices `moved`. ending:
-    of the span that the next one goes on from, None where there is none. sigma (channels,): noise of the last span's
-    readings, NaN where it is not known.
+    known: from the spans so far; before: without the last one, which a change may have disturbed. ending: of the span
+    that the next one goes on from, None where there is none. change: begin and end of the span that contradicts those
+    before it, s, None without one; wanted: length of the span behind it, s. events: so far; added: names of the
+    parameters that they have added.
     """
 
     known: SmootherStatistics
-    t: Array
-    values: Array
-    index: Indices
-    torque: Array
-    moved: Indices
-    motion: Array
-    sigma: Array
+    before: SmootherStatistics
     ending: Ending | None = None
+    change: tuple[float, float] | None = None
+    wanted: float = BEHIND
+    events: list[Event] = msgspec.field(default_factory=list)
+    added: list[str] = msgspec.field(default_factory=list)
 
 
 class Smoother(Stage):
     """Estimates the base parameters of a session from all its samples and the equations of motion.
 
     It works span by span: a span's rows of independent unit errors join those of the spans before it. channels: of the
-    readings that it uses, see `sensor_set.Readings`. prior: what is known beforehand, or None.
+    readings that it uses, see `sensor_set.Readings`. prior: what is known beforehand of the parameters as described, or
+    None. trackers: those that are chosen, the judged one first: the next span is fitted beside what it knows. changed:
+    called where other parameters come to be estimated behind a change; None where it is not to look for any.
     """
 
-    def __init__(self, model: Model, base: BaseParameters, sensing: Sensing, available: Sequence[str]) -> None:
-        self._model, self._base, self._sensing = model, base, sensing
-        self._rate, joints = model.system.sample_rate, len(model.system.joints)
+    def __init__(
+        self, model: Model, base: BaseParameters, sensing: Sensing, available: Sequence[str],
+        trackers: Sequence[TrackerChoice], changed: Callable[[], None] | None,
+    ) -> None:  # fmt: skip
+        self._rate = model.system.sample_rate
         self.channels = tuple(name for name in readable_channels(model) if name in available)
         self.prior: Prior | None = None
-        self._synchroniser = Synchroniser([f"n_tau_{i}" for i in range(1, joints + 1)], self._rate)
-        self._readings = ReadingNuisances(model, self.channels)
-        self._first_motion = FirstMotion(model, sensing, self.channels)
-        tolerances = np.array([each.tolerance for each in self.nuisances])
-        n = tolerances.size + base.n
-        nothing = np.zeros((n + 1, n + 1)), np.full(n, np.nan)
-        self.state = SmootherState(
-            known=SmootherStatistics((), 0, np.nan, np.nan, *nothing, 0, 0.0, np.nan, -np.inf, 0, tolerances),
-            t=np.empty(0),
-            values=np.empty((0, len(self.channels))),
-            index=np.empty((0, 2), dtype=np.int64),
-            torque=np.empty((0, joints)),
-            moved=np.empty(0, dtype=np.int64),
-            motion=np.empty((0, model.layout.n_x + model.layout.n_v)),
-            sigma=np.full(len(self.channels), np.nan),
-        )
+        self.gathered = Gatherer(model, len(self.channels))
+        self._noise = SpanNoise(model, sensing, self.channels)
+        self._choices, self._changed = tuple(trackers), changed
+        # Where parameters may move anyway, nothing jumps.
+        self._watches = changed is not None and trackers[0].static
+        self._problem = SpanProblem(model, base, sensing, self.channels)
+        self._changes = SpanChanges(self._problem, sensing, self.channels)
+        self.trackers = self._new_trackers()
+        nothing = SmootherStatistics.none(np.array([each.tolerance for each in self.nuisances]), base.n)
+        self.state = SmootherState(nothing, nothing)
+
+    def renew(self) -> None:
+        """See Stage."""
+        if self.state.added:
+            self._problem = self._changes.problem(self.state.added)
+            self.trackers = self._new_trackers()
+        if self.state.events and self._changed is not None:
+            self._changed()
 
     def set_prior(self, prior: Prior) -> None:
         """Add what is known of the base parameters beforehand as a prior; before the first sample."""
         self.prior = prior
+        self.trackers = self._new_trackers()
 
-    def resume(self, end: float) -> None:
-        """Count nothing as lost from `end`, s, to the next sample: the session did not listen."""
-        self._synchroniser.resumed = end
+    def _new_trackers(self) -> SpanTrackers:
+        name, parameters = self.model.system.name, self.base.parameters
+        prior = self.current_prior if self.prior is not None else None
+        return SpanTrackers(self._choices, name, parameters, self.nuisances, prior, NEXT_SPAN)
+
+    @property
+    def model(self) -> Model:
+        """The model, with what events have added."""
+        return self._problem.model
+
+    @property
+    def base(self) -> BaseParameters:
+        """The parameters that are estimated, with what events have added."""
+        return self._problem.base
+
+    @property
+    def events(self) -> list[Event]:
+        """Changes of the system so far."""
+        return self.state.events
 
     @property
     def nuisances(self) -> tuple[Nuisance, ...]:
         """What its readings may be off by."""
-        return self._readings.all
+        return self._problem.readings.all
+
+    @property
+    def current_prior(self) -> Prior | None:
+        """What is known beforehand of the current parameters."""
+        return None if self.prior is None else prior_behind(self.state.events, self.prior, self.base.parameters)
 
     @property
     def end(self) -> float:
@@ -179,23 +146,9 @@ class Smoother(Stage):
         """From the spans so far."""
         return self.state.known
 
-    def push(self, t: Array, torque: Array, values: Array) -> None:
-        """Take samples at t (B,), s, in order of time: n τ (B, joints), readings (B, channels), else NaN."""
-        now = self.state
-        now.t, now.values = np.concatenate((now.t, t)), np.concatenate((now.values, values))
-        for piece in self._synchroniser.push(Block(t, self._synchroniser.channels, torque)):
-            self._keep(piece)
-
-    def _keep(self, piece: GridSamples) -> None:
-        now = self.state
-        index = np.stack((piece.index, np.full(piece.index.size, piece.segment)), axis=1)
-        now.index, now.torque = np.concatenate((now.index, index)), np.concatenate((now.torque, piece.values))
-
-    def move(self, index: Indices, x: Array, v: Array) -> None:
-        """Take the motion as the sensors alone give it, at grid samples (B,): x (B, n_x), v (B, n_v)."""
-        now = self.state
-        now.moved = np.concatenate((now.moved, index))
-        now.motion = np.concatenate((now.motion, np.concatenate((x, v), axis=1)))
+    def resume(self, end: float) -> None:
+        """Count nothing as lost from `end`, s, to the next sample: the session did not listen."""
+        self.gathered.resume(end)
 
     def work(self, first_fit: Callable[[], Estimate], last: bool = False) -> None:
         """Fit the spans that are complete; `last` at the end of the session.
@@ -203,182 +156,168 @@ class Smoother(Stage):
         first_fit: gives an estimate to begin with, until a span has one.
         """
         if last:
-            for piece in self._synchroniser.flush():
-                self._keep(piece)
-        while (count := self._complete(last)) > 0:
-            end = int(self.state.index[count - 1, 0])
-            if not last and not (self.state.moved.size and self.state.moved[-1] >= end):
-                return
-            if count > max(LEAST_SPAN * self._rate, FEWEST_SAMPLES):
-                self._fit(count, first_fit)
-            else:
+            self.gathered.finish()
+        while (count := self.gathered.complete(self._length, last)) > 0:
+            if count <= max(LEAST_SPAN * self._rate, FEWEST_SAMPLES):
                 self.state.ending = None
-            self._forget(count)
+            elif not self._fit(count, first_fit):
+                continue
+            if not self.gathered.forget(count):
+                self.state.ending = None
+        if last and self.state.change is not None:
+            self._add_event("undecided", self.state.change)
 
-    def _complete(self, last: bool) -> int:
-        """Torque samples of the first span, 0 where more of them may come."""
-        segment = self.state.index[:, 1]
-        run = int(np.searchsorted(segment, segment[0], side="right")) if segment.size else 0
+    @property
+    def _length(self) -> int:
+        """Torque samples of the next span."""
         length = SPAN if self.state.ending is None else NEXT_SPAN
-        longest = max(round(length * self._rate), FEWEST_SAMPLES) + 1
-        most = longest + round(LATER_END * self._rate)
-        if run < longest:
-            return run if last or run < segment.size else 0
-        # A span ends, and the next one begins, where the motion is known: a first state that is guessed rings.
-        known = np.flatnonzero(np.isin(self.state.index[longest - 1 : min(run, most), 0], self.state.moved))
-        if known.size:
-            return longest + int(known[0])
-        moved = self.state.moved[-1] if self.state.moved.size else -1
-        over = last or run < segment.size or (run >= most and moved >= self.state.index[most - 1, 0])
-        return longest if over else 0
+        if self.state.change is not None:
+            length = self.state.wanted
+        return max(round(length * self._rate), FEWEST_SAMPLES) + 1
 
-    def _time(self, index: Indices) -> Array:
-        return np.asarray(self._synchroniser.start_time + index / self._rate)
-
-    def _forget(self, count: int) -> None:
-        """Drop a span; the sample that ends it begins the next one, if there is no gap between them."""
+    def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> bool:
+        """Fit a span; whether that is done, and no more samples are wanted for it."""
         now = self.state
-        goes_on = count < len(now.index) and now.index[count, 1] == now.index[count - 1, 1]
-        dropped = count - 1 if goes_on else count
-        if not goes_on:
-            now.ending = None
-        end = now.index[count - 1, 0]
-        now.index, now.torque = now.index[dropped:], now.torque[dropped:]
-        kept = now.t > self._time(end)
-        now.t, now.values = now.t[kept], now.values[kept]
-        kept = now.moved >= end
-        now.moved, now.motion = now.moved[kept], now.motion[kept]
-
-    def _fit(self, count: int, first_fit: Callable[[], Estimate]) -> None:
-        """Fit a span; once more where it does not agree with its samples, and these show more noise than is stated."""
-        now = self.state
-        begin, end, t, values = self._samples(count)
-        fit = self._fitted(count, t, values, first_fit)
-        if self._doubtful(fit) and self._noisier(t, values):
-            fit = self._fitted(count, t, values, first_fit)
-        if isinstance(fit, SpanFit):
-            now.ending = fit.ending
-            self._take(fit, end)
+        if now.change is not None:
+            step = self._step(count)
+            if not (count < self._length or now.wanted >= LONGEST_BEHIND or (step is not None and step.clear)):
+                now.wanted = LONGEST_BEHIND
+                return False
+            if self._goes_on(step, count, first_fit):
+                return True
+        fit = self._fitted(count, first_fit)
+        if self._doubtful(fit) and self._noise.shows_more(self.gathered, count):
+            # The samples show more noise than is stated.
+            now.known = self.known._replace(noisier=self._noise.state.noisier)
+            fit = self._fitted(count, first_fit)
+        begin, end, _, _ = self.gathered.span(count)
+        if self._settled and contradicts(self._beforehand, fit):
+            now.change, now.wanted = (begin, end), BEHIND
+            now.known, now.ending = now.before, None
+        elif isinstance(fit, SpanFit):
+            self._take(fit, begin, end)
         else:
-            failures = (*now.known.failures, f"{begin:.6g} … {end:.6g} s: {fit}")
-            now.known, now.ending = now.known._replace(failures=failures), None
+            failures = (*self.known.failures, f"{begin:.6g} … {end:.6g} s: {fit}")
+            now.known, now.ending = self.known._replace(failures=failures), None
+        return True
 
-    def _samples(self, count: int) -> tuple[float, float, Array, Array]:
-        """Begin and end of the span of `count` torques, s, and t (M,) and values (M, channels) of its readings."""
-        now = self.state
-        begin, end = self._time(now.index[[0, count - 1], 0]).tolist()
-        inside = (now.t >= begin) & (now.t <= end)
-        return begin, end, now.t[inside], now.values[inside]
+    @property
+    def _settled(self) -> bool:
+        """Whether a span that does not agree with those before it shows a change."""
+        return self._watches and bool(self.known.spans) and self.known.exact
 
     def _doubtful(self, fit: SpanFit | DivergedError) -> bool:
         if isinstance(fit, DivergedError):
             return True
         return fit.mean_square > LARGEST_MEAN_SQUARE or fit.torque_noise > self.known.torque_noise
 
-    def _fitted(
-        self, count: int, t: Array, values: Array, first_fit: Callable[[], Estimate]
-    ) -> SpanFit | DivergedError:
-        """Fit of the first `count` torques and of readings (M, channels) at t (M,), s; or why there is none."""
+    def _fitted(self, count: int, first_fit: Callable[[], Estimate]) -> SpanFit | DivergedError:
+        """Fit of the first `count` torques; or why there is none."""
         past = self.known
         try:
-            smoother, span = self._problem(count, t, values)
-            beta = past.beta if past.spans else self._beginning(first_fit)
+            smoother, span = self._span_problem(count)
+            beta = past.beta if np.isfinite(past.beta).all() else self._beginning(first_fit)
             last_step = past.last_step if past.spans else None
-            return smoother.fit(span, beta, self._beforehand, last_step, self.state.ending)
+            return smoother.fit(span, beta, self._beforehand, last_step, self.state.ending, self._settled)
         except DivergedError as error:
             return error
+
+    def _span_problem(self, count: int) -> tuple[SpanSmoother, Span]:
+        """What fits the first `count` torques, and their span; DivergedError where there is no motion to begin with."""
+        noise = self._noise(self.gathered, count, goes_on=self.state.ending is not None)
+        return self._problem(self.gathered, count, *noise, self.known.torque_noise)
 
     @property
     def _beforehand(self) -> Array:
         """What is known of nuisances and parameters before a span, as a factor (m + n + 1, m + n + 1)."""
-        return triangular_factor(self.known.beforehand(self.prior), self.known.factor)
+        tracked = self.trackers.factor
+        past = self.known.factor if tracked is None else tracked / LOOSER
+        return triangular_factor(self.known.beforehand(self.current_prior), past)
 
     def _beginning(self, first_fit: Callable[[], Estimate]) -> Array:
-        """β (m + n,) that the first span begins with; DivergedError where it is no mechanism's."""
-        return np.concatenate((np.zeros(len(self.nuisances)), self._realisable(first_fit())))
-
-    def _problem(self, count: int, t: Array, values: Array) -> tuple[SpanSmoother, Span]:
-        """What fits a span, and the span: see `_fitted`. DivergedError where there is no motion to begin with."""
-        now = self.state
-        torque_t = self._time(now.index[:count, 0])
-        moved = (now.moved >= now.index[0, 0]) & (now.moved <= now.index[count - 1, 0])
-        sigma, torque_density = self._noise(t, values, now.torque[:count])
-        sensed = np.flatnonzero(np.isfinite(sigma))
-        readings = Readings(self._model, [self.channels[k] for k in sensed])
-        noise = sigma[sensed], torque_density
-        of_channels = self._readings, sensed.tolist()
-        smoother = SpanSmoother(self._model, self._base, readings, *noise, *of_channels, self.known.torque_noise)
-        if not moved.any():
-            raise DivergedError("the sensors give no motion to begin with")
-        guess = self._first_motion(self._time(now.moved[moved]), now.motion[moved], t, values)
-        return smoother, Span(torque_t, now.torque[:count], t, values[:, sensed], *guess)
-
-    def _take(self, fit: SpanFit, end: float) -> None:
-        past = self.state.known
-        known = SmootherStatistics(
-            failures=past.failures,
-            spans=past.spans + 1,
-            level=float(np.fmax(past.level, fit.level)),
-            mean_square=float(np.fmax(past.mean_square, fit.mean_square)),
-            factor=triangular_factor(past.factor, fit.factor),
-            beta=fit.beta,
-            rows=past.rows + fit.rows,
-            rss=past.rss + fit.rows * fit.mean_square,
-            last_step=fit.step,
-            end=end,
-            lost=self._synchroniser.counters.lost_samples,
-            tolerances=past.tolerances,
-            torque_noise=max(past.torque_noise, fit.torque_noise),
-            noisier=past.noisier,
-            blocks=with_span(past.blocks, fit.rows, fit.factor),
-        )
-        # Here, as it takes a solution for each block, and estimates are asked for more often than spans end.
-        scatter = None if known.exact else jackknife_covariance(known.blocks, known.beforehand(self.prior))
-        self.state.known = known._replace(scatter=scatter)
-
-    def _noisier(self, t: Array, values: Array) -> bool:
-        """Whether samples (M, channels) at t (M,) show more noise than is taken so far; then that is taken."""
-        stated, times = stated_noise(self._model.system, self.channels), dict(self.known.noisier)
-        found = dict(times)
-        for k in np.flatnonzero(np.isfinite(stated)):
-            name, own = self.channels[k], np.flatnonzero(np.isfinite(values[:, k]))[-SAMPLES:]
-            if own.size >= FEWEST_SAMPLES:
-                shown = float(noise_std(values[own, k][:, None], t[own])[0] / stated[k])
-                if shown > NOISIER * times.get(name, 1.0):
-                    found[name] = shown
-        self.state.known = self.known._replace(noisier=tuple(found.items()))
-        return found != times
-
-    def _realisable(self, estimate: Estimate) -> Array:
-        """β (n,) of the physically consistent parameters nearest to an estimate."""
+        """β (m + n,) of the physically consistent parameters nearest to a first fit; DivergedError where none are."""
+        estimate = first_fit()
         variance = estimate.rss / estimate.dof if estimate.scale is None and estimate.dof > 0.0 else 1.0
         covariance = np.where(np.isfinite(estimate.covariance), estimate.covariance * max(variance, 1.0), np.inf)
         try:
-            return PhysicalSet(self._model, self._base).project(estimate.pi, covariance).beta
+            found = PhysicalSet(self.model, self.base).project(estimate.pi, covariance)
         except ArithmeticError as error:
             raise DivergedError(str(error)) from None
+        return np.concatenate((np.zeros(len(self.nuisances)), found.beta))
 
-    def _noise(self, t: Array, values: Array, torque: Array) -> tuple[Array, Array]:
-        """Noise of samples at t (channels,), NaN where nothing is known of it, and the torques' density (joints,)."""
-        times = dict(self.known.noisier)
-        sigma = stated_noise(self._model.system, self.channels) * [times.get(name, 1.0) for name in self.channels]
-        if self.state.ending is not None:
-            # A short span has too few samples of a slow channel.
-            sigma = np.where(np.isnan(sigma), self.state.sigma, sigma)
-        for k in np.flatnonzero(np.isnan(sigma)):
-            own = np.flatnonzero(np.isfinite(values[:, k]))[-SAMPLES:]
-            if own.size >= FEWEST_SAMPLES:
-                sigma[k] = noise_std(values[own, k][:, None], t[own])[0]
-        self.state.sigma = sigma
-        largest = np.max(np.abs(values), axis=0, initial=0.0, where=np.isfinite(values))
-        sigma = np.maximum(sigma, FINEST * largest + np.finfo(np.float64).tiny)
-        drives = self._sensing.noise[self._model.layout.n_x :]
-        silent = np.isnan(drives)
-        drives[silent] = noise_std(torque[-SAMPLES:, silent])
-        drives = np.maximum(drives, FINEST * np.abs(torque).max(axis=0) + np.finfo(np.float64).tiny)
-        periods = np.fmax(self._synchroniser.periods, 1.0 / self._rate)
-        return sigma, drives**2 * periods
+    def _take(self, fit: SpanFit, begin: float, end: float) -> None:
+        now = self.state
+        now.before, now.ending = now.known, fit.ending
+        now.known = now.known.with_span(fit, end, self.gathered.lost, self.current_prior)
+        self.trackers.update(fit, 0.5 * (begin + end))
+
+    def _goes_on(self, step: Step | None, count: int, first_fit: Callable[[], Estimate]) -> bool:
+        """Go on behind a change with the step that explains it best, or anew; whether the span is taken already."""
+        now, past, change = self.state, self.known, self.state.change
+        assert change is not None
+        now.change = None
+        if step is not None and not step.explanation.needed:
+            # Nothing has changed.
+            return False
+        if step is not None and step.explains and self._adopt(step, change, count, first_fit):
+            return True
+        self._add_event("unexplained", change)
+        nothing = SmootherStatistics.none(past.tolerances, self.base.n)
+        now.known = nothing._replace(beta=past.beta, failures=past.failures, noisier=past.noisier)
+        self._begin_behind()
+        return False
+
+    def _step(self, count: int) -> Step | None:
+        """The step that explains a span behind a change best; None where no parameters explain it."""
+        try:
+            noise = (*self._noise(self.gathered, count, goes_on=False), self.known.torque_noise)
+            known = self._beforehand, self.known.beta
+            return self._changes.explain(self.gathered, count, noise, known, self._problem, self.state.added)
+        except DivergedError:
+            return None
+
+    def _adopt(self, step: Step, change: tuple[float, float], count: int, first_fit: Callable[[], Estimate]) -> bool:
+        """Go on with parameters that have jumped, from the span behind it; whether its samples agree with that."""
+        now, problem, past = self.state, self._problem, self.known
+        added = [*now.added, *step.fresh]
+        self._problem = self._changes.problem(added)
+        names = [p.name for p in self.base.parameters]
+        jumped = [len(self.nuisances) + names.index(name) for name in step.names]
+        beta = np.concatenate((step.explanation.beta, np.zeros(len(step.fresh))))
+        beta[jumped] += step.explanation.sizes
+        known = Information(past.factor, past.rows).widened(len(step.fresh)).without(jumped)
+        now.known = past._replace(factor=known.factor, beta=beta, blocks=())
+        self._add_event(step.kind, change, step)
+        fit = self._fitted(count, first_fit)
+        if isinstance(fit, DivergedError) or contradicts(self._beforehand, fit):
+            self._problem, now.known, now.events = problem, past, now.events[:-1]
+            return False
+        now.added = added
+        self._begin_behind()
+        begin, end, _, _ = self.gathered.span(count)
+        self._take(fit, begin, end)
+        now.before = now.known
+        return True
+
+    def _begin_behind(self) -> None:
+        if self._changed is not None:
+            self._changed()
+        self.trackers = self._new_trackers()
+        self.trackers.begin(Information(self.known.factor, self.known.rows))
+
+    def _add_event(self, kind: str, change: tuple[float, float], step: Step | None = None) -> None:
+        event = Event(0.5 * (change[0] + change[1]), kind, (), (), (), (), LEFT_OUT)
+        if step is not None:
+            units, found = {p.name: p.unit for p in self.base.parameters}, step.explanation
+            of_names, sizes, stds = (units[name] for name in step.names), found.sizes.tolist(), found.stds.tolist()
+            event = replace(event, parameters=step.names, units=tuple(of_names), sizes=tuple(sizes), stds=tuple(stds))
+        self.state.events = [*self.state.events, event]
 
     def estimate(self) -> Estimate:
-        """The base parameters as known now, with the prior; only after the first span."""
-        return self.known.estimate(self.prior)
+        """The base parameters as the judged tracker knows them now, with the prior; only after the first span."""
+        readings = self.readings()
+        return readings[0].estimate if readings else self.known.estimate(self.current_prior)
+
+    def readings(self) -> tuple[Reading, ...]:
+        """Each chosen tracker's estimate, the judged one first; empty where that is its own least squares alone."""
+        return self.trackers.readings(self.known.estimate(self.current_prior)) if self.trackers.any else ()

@@ -33,7 +33,7 @@ class Tracked:
 
     parameters (n,): columns behind those of nuisances. prior: of nuisances and parameters (m + n,), where something is
     known beforehand; scaled: its scale follows the rows', see `RecursiveLeastSquares`. rows_per_second: of the balance.
-    source: name of the system, for messages.
+    source: name of the system, for messages. rows_a_look: from one look whether all is determined to the next.
     """
 
     parameters: Sequence[Parameter]
@@ -42,6 +42,7 @@ class Tracked:
     scaled: bool
     rows_per_second: float
     source: str
+    rows_a_look: int
 
     @property
     def n(self) -> int:
@@ -92,7 +93,7 @@ def _kalman(choice: TrackerChoice, tracked: Tracked) -> Tracker:
     drifts = drifts_of(choice, tracked.parameters, tracked.source)
     std = process_std(choice, tracked, drifts)
     if not {"trend", "learned"} & set(drifts):
-        return RandomWalk(tracked.n, std, tracked.prior)
+        return RandomWalk(tracked.n, std, tracked.prior, tracked.rows_a_look)
     trends = np.where(_columns(drifts, "trend", tracked.nuisances), std, 0.0)
     walks = np.where(_columns(drifts, "random_walk", tracked.nuisances), std, 0.0)
     return LearnedTrend(tracked.n, _groups(drifts, tracked), trends, walks, tracked.prior)

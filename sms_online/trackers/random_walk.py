@@ -9,8 +9,6 @@ from sms_online.trackers.interface import Estimate, Prior, Rows, Tracker
 from sms_online.trackers.kalman import KalmanTracker
 from sms_online.trackers.square_root import RecursiveLeastSquares
 
-# From one check whether all is determined to the next: rows for each parameter.
-ROWS_A_PARAMETER = 20
 # Initial deviation, in those of the least squares that it starts from: no more than 1e-6 of their information, and the
 # deviation beyond which no parameter walks.
 INITIAL = 1000.0
@@ -27,6 +25,8 @@ class WalkState(State):
 class RandomWalk(Tracker):
     """Random walk of π, process_std (n,) in units per √s, with a prior on some of it; see `KalmanTracker`.
 
+    rows_a_look: from one look whether the rows determine all parameters to the next.
+
     A covariance filter needs a finite initial covariance, which is unknown: until the rows determine all parameters
     this is recursive least squares, in square-root information form, and the filter starts from its result. Where the
     rows never determine a parameter it stays that. With scaled columns the paper's example has a condition number of
@@ -34,8 +34,8 @@ class RandomWalk(Tracker):
     and is in square-root information form therefore, see `drift`.
     """
 
-    def __init__(self, n: int, process_std: Array, prior: Prior) -> None:
-        self._n, self._process_std, self._prior = n, process_std, prior
+    def __init__(self, n: int, process_std: Array, prior: Prior, rows_a_look: int) -> None:
+        self._n, self._process_std, self._prior, self._rows_a_look = n, process_std, prior, rows_a_look
         self._filter: KalmanTracker | None = None
         self.state = WalkState()
         self.begin(Information.none(n))
@@ -50,7 +50,7 @@ class RandomWalk(Tracker):
                 continue
             self._squares.update(row)
             self.state.taken += 1
-            if self.state.taken % (ROWS_A_PARAMETER * self._n) == 0:
+            if self.state.taken % self._rows_a_look == 0:
                 self._start()
 
     def _start(self) -> None:

@@ -89,8 +89,7 @@ def ambiguous_effects(evaluation: Evaluation) -> list[Reason]:
 def _moving(evaluation: Evaluation) -> list[int]:
     """Columns of the parameters that drift in the judged estimate: as was found, or as its choice lets them."""
     now = evaluation.statistics
-    readings = () if now.momentum is None else now.momentum.trackers
-    found = [drift.column for drift in readings[0].drifts] if readings else []
+    found = [drift.column for drift in now.readings[0].drifts] if now.readings else []
     choice = now.setup.trackers[0]
     if choice.kind != "kalman":
         return found

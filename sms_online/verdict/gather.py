@@ -21,7 +21,7 @@ from sms_online.verdict.torque_noise import noisy_torques
 from sms_online.verdict.trust import Reason
 
 if TYPE_CHECKING:
-    from sms_online.smoother.session import SmootherStatistics
+    from sms_online.smoother.statistics import SmootherStatistics
 
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
