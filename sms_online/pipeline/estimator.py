@@ -128,7 +128,7 @@ class Estimator(Stage):
         self._first_block, self._block = blocks(system, slowest, whole)
         self.finished = False  # no more samples come
         self.prior: Prior | None = None
-        self._setup: tuple[tuple[int, Method], Setup] | None = None  # since so many events, by this method
+        self._setup: tuple[int, Setup] | None = None  # and the number of events that it is since
         self.state = EstimatorState(np.empty(0), np.empty((0, len(self._columns))))
 
     @property
@@ -182,19 +182,14 @@ class Estimator(Stage):
         return self.smoother if self.momentum is None else self.momentum.changes
 
     @property
-    def _estimating(self) -> Changes | Smoother | None:
-        """What knows the parameters that are estimated now; None where these are the system's own."""
-        return None if self.method == "energy" else self._changing
-
-    @property
     def model(self) -> Model:
         """The system's model, with what events have added to it."""
-        return self._model if self._estimating is None else self._estimating.model
+        return self._model if self._changing is None else self._changing.model
 
     @property
     def base(self) -> BaseParameters:
         """The parameters that are estimated: the system's own, and what events have added to them."""
-        return self._base if self._estimating is None else self._estimating.base
+        return self._base if self._changing is None else self._changing.base
 
     @property
     def events(self) -> list[Event]:
@@ -234,8 +229,14 @@ class Estimator(Stage):
     @property
     def by_smoother(self) -> bool:
         """Whether the estimate comes from the smoother, which holds as long as nothing changes."""
-        known = self.smoother is not None and self.smoother.known.spans > 0
-        return known and (self.momentum is None or not self.events)
+        if self.smoother is None:
+            return False
+        # Behind a change that nothing explains its estimate is that nothing is known.
+        return (
+            self.smoother.known.spans > 0
+            if self.momentum is not None and not self.events
+            else (self.momentum is None and (self.smoother.known.spans > 0 or bool(self.events)))
+        )
 
     @property
     def by_momentum(self) -> bool:
@@ -260,8 +261,7 @@ class Estimator(Stage):
     @property
     def setup(self) -> Setup:
         """What is estimated now: one object from one event to the next."""
-        instant = len(self.events), self.method
-        if self._setup is None or self._setup[0] != instant:
+        if self._setup is None or self._setup[0] != len(self.events):
             behind = self.smoother if self.momentum is None else self.momentum
             current = self.prior if behind is None else behind.current_prior
             now = self.model, self.base, self._base
@@ -269,7 +269,7 @@ class Estimator(Stage):
             smoothed = () if self.smoother is None else self.smoother.nuisances
             channels, priors = (self.sensing, self.unused), (self.prior, current)
             setup = Setup(self.system, *now, *channels, *priors, nuisances, smoothed, self.trackers)
-            self._setup = instant, setup
+            self._setup = len(self.events), setup
         return self._setup[1]
 
     @property

@@ -40,8 +40,10 @@ NEARLY_EXACT = (0.0, 3.0)
 # motion. And how far parameters may be from the description then, as a share of it, 1σ: held, where they run away.
 FOLLOWING = (3.0, 1.0, 0.3, 0.1)
 NEAR, HELD = 0.5, 1e-4
-# Steps of the collocation, s, ever finer.
+# Steps of the collocation, s, ever finer. Where a motion is too fast for those of the spans before: a share of them,
+# and the interval of the derivatives, s.
 STEPS = (0.005, 0.0025, 0.00125)
+FINER, FAST_INTERVAL = 0.5, 0.01
 
 
 @contextmanager
@@ -91,8 +93,13 @@ class SpanSmoother(SmoothedReadings):
                 with suppress(*NO_NUMBERS):
                     search = Search(self, span, beta, known, before=before)
                     return search.through(NEXT_LEVELS, (last_step,), exactly)
-            try:
+            with suppress(*NO_NUMBERS):
                 return Search(self, span, beta, known).through(LATER_LEVELS, (last_step,), exactly)
+            try:
+                # The motion may be too fast for such steps and derivatives.
+                search = Search(self, span, beta, known, interval=FAST_INTERVAL)
+                search.refine(last_step)
+                return search.through(LATER_LEVELS, (last_step, FINER * last_step), exactly)
             except NO_NUMBERS:
                 if exactly:
                     raise

@@ -49,7 +49,7 @@ REFINED = 1.0
 # smaller by far, as the convergence is quadratic near the end.
 CONVERGED = 0.5
 MAX_STEPS = 16
-# Derivatives by displacements are computed that often and interpolated, s; they only steer the search.
+# Derivatives by displacements are computed that often as a rule, s.
 DERIVATIVES_INTERVAL = 0.04
 # Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
 # the noise behind it is estimated to a tenth.
@@ -142,14 +142,15 @@ class Search:
     """The state of a search: β and the motion, and what the last step was made of.
 
     reach (n,): how far a step takes parameters that loose equations do not determine, as a standard deviation; 0 where
-    that is not known. before: see `fit.SpanSmoother`.
+    that is not known. before: see `fit.SpanSmoother`. interval: from one computed derivative by displacements to the
+    next, s; between them they are interpolated, and only steer the search.
     """
 
     def __init__(
         self, smoother: SmoothedReadings, span: Span, beta: Array, known: Array, reach: Array | None = None,
-        before: Ending | None = None,
+        before: Ending | None = None, interval: float = DERIVATIVES_INTERVAL,
     ) -> None:  # fmt: skip
-        self._before = before
+        self._before, self._interval = before, interval
         self.reach = np.zeros(beta.size) if reach is None else reach
         self._smoother, self._span, self._known = smoother, span, known
         self._model, self._base = smoother.model, smoother.base
@@ -200,15 +201,18 @@ class Search:
         return self.tightened(steps, exactly)
 
     def tightened(self, steps: Sequence[float], exactly: bool = False) -> SpanFit:
-        """The fit with equations that hold, or that hold as well as the samples allow: not if they are to `exactly`."""
+        """The fit with equations that hold, or that hold as well as the samples allow.
+
+        exactly: they are to leave no more than noise; else DivergedError.
+        """
         for k, step in enumerate(steps):
             self.refine(step)
             before = self.beta, self.motion
-            if not self.converge(0.0):
+            if not self.converge(0.0, strictly=exactly):
                 break
             if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
                 break
-        if self.mean_square <= LARGEST_MISFIT:
+        if self.mean_square <= (LARGEST_MEAN_SQUARE if exactly else LARGEST_MISFIT):
             return self._taken(0.0, step)
         if exactly:
             raise DivergedError("samples do not agree with the equations of motion")
@@ -243,8 +247,11 @@ class Search:
             if self.mean_square <= LARGEST_MEAN_SQUARE:
                 return
 
-    def converge(self, level: float, wanted: slice = slice(None), tame: bool = False) -> bool:
-        """Search until β, or what is wanted of it, converges or steps scatter within its errors; whether it does."""
+    def converge(self, level: float, wanted: slice = slice(None), tame: bool = False, strictly: bool = False) -> bool:
+        """Search until β, or what is wanted of it, converges or steps scatter within its errors; whether it does.
+
+        strictly: it is to converge.
+        """
         self._held = False
         targets: list[Array] = []
         with suppress(*NO_NUMBERS):
@@ -256,7 +263,7 @@ class Search:
                     return True
                 longest = LONGEST_STEP if self.mean_square <= LARGEST_MEAN_SQUARE else LONGEST_MISFIT
                 targets = [*targets, before + self._asked] if np.all(step <= longest * self.std[wanted]) else []
-        if len(targets) >= FEWEST_TARGETS:
+        if len(targets) >= FEWEST_TARGETS and not strictly:
             self.factor, self.beta = averaged(self.factor, targets[-FEWEST_TARGETS:])
             self.std = np.sqrt(np.diag(solve(triangular_factor(self._known, self.factor)).covariance()))
             return True
@@ -270,7 +277,7 @@ class Search:
         differences = self._innovations(motion.x, motion.v)
         lacking = defects(dynamics, motion, self._impulse, self._impulse_m)
         kalman = FixedIntervalSmoother(*self._first_state(dynamics))
-        every = max(1, round(DERIVATIVES_INTERVAL / motion.step))
+        every = max(1, round(self._interval / motion.step))
         nodes = every * max(1, 512 // every)
         drive, joints = self._drive(dynamics, level, tame), self._smoother.motors.shape[1]
         n_v, m = self._model.layout.n_v, self._smoother.m
