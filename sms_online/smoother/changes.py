@@ -6,6 +6,7 @@ and these rows compare the hypotheses, as behind an event of the momentum balanc
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from operator import itemgetter
@@ -15,6 +16,7 @@ import numpy as np
 from sms_online.description.bodies import FlexibleLink, Inertia, RigidBody
 from sms_online.description.schema import System
 from sms_online.effects.build import build_model, changed_model
+from sms_online.model.base_parameters import BaseParameters
 from sms_online.pipeline.event_hypotheses import (
     Explanation,
     Jump,
@@ -40,8 +42,9 @@ ALARM = 15.0
 LEVELS, ADVANCES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0), 2
 FINE, FINE_STEP = 0.003, 0.005
 # A payload's inertia is hard to find from nothing: it is looked for from one of such shares of the heaviest link's
-# mass, too, with a radius of gyration of such a share of the longest link.
-PAYLOADS, GYRATION = (0.0, 0.3, 3.0), 0.2
+# mass, too, with a radius of gyration of such a share of the longest link. What is left of one that is released is
+# looked for from such a share of it.
+PAYLOADS, GYRATION, LESS = (0.3, 3.0), 0.2, 0.05
 # Mean square of the whitened innovations that the right step leaves, as far as it is found: the fit behind it is exact.
 EXPLAINED = 4.0
 
@@ -114,9 +117,9 @@ class SpanChanges:
         m = smoother.m
         jumps = [replace(jump, columns=tuple(m + k for k in jump.columns)) for jump in hypotheses(base.parameters)]
         tried = list[tuple[float, Explanation]]()
-        for share in PAYLOADS:
-            payload = _payload(system, share) if share else {}
-            start = np.concatenate((known[1], [payload.get(name, 0.0) for name in names]))
+        past = np.concatenate((known[1], np.zeros(len(names))))
+        carried = [m + k for k, p in enumerate(base.parameters) if p.name.startswith("payload.")]
+        for start in [past, *_with_payloads(past, carried, base, system)]:
             with suppress(DivergedError):
                 tried.append(_tightened(Search(smoother, span, start, np.empty((0, start.size + 1))), known[0], jumps))
                 if tried[-1][0] <= EXPLAINED:
@@ -152,12 +155,21 @@ def _tightened(search: Search, known: Array, jumps: list[Jump]) -> tuple[float, 
     return search.mean_square, found
 
 
-def _payload(system: System, share: float) -> dict[str, float]:
-    """Values by name of the parameters of a payload that has a share of the heaviest link's mass."""
+def _with_payloads(past: Array, carried: list[int], base: BaseParameters, system: System) -> Iterator[Array]:
+    """β (m + n,) as it was, with payloads in place of none, or with less of one; carried: their columns."""
+    if past[carried].any():
+        less = past.copy()
+        less[carried] *= LESS
+        yield less
+        return
     flexible = [link for link in system.links if isinstance(link, FlexibleLink)]
     masses = [link.mass for link in system.links if not isinstance(link, FlexibleLink)]
-    mass = share * max([*masses, *(link.mass_per_length * link.length for link in flexible)])
-    about = mass * (GYRATION * max([link.length for link in flexible], default=1.0)) ** 2
-    body = RigidBody(mass=mass, inertia=Inertia(xx=about, yy=about, zz=about))
-    model = build_model(system.model_copy(update={"payload": body}))
-    return {p.name: p.nominal for p in model.parameters if p.name.startswith("payload.")}
+    heaviest = max([*masses, *(link.mass_per_length * link.length for link in flexible)])
+    about = (GYRATION * max([link.length for link in flexible], default=1.0)) ** 2
+    for mass in (share * heaviest for share in PAYLOADS):
+        body = RigidBody(mass=mass, inertia=Inertia(xx=mass * about, yy=mass * about, zz=mass * about))
+        model = build_model(system.model_copy(update={"payload": body}))
+        value = {p.name: p.nominal for p in model.parameters}
+        with_one = past.copy()
+        with_one[carried] = [value[base.parameters[k - past.size + base.n].name] for k in carried]
+        yield with_one

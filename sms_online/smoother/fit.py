@@ -17,6 +17,7 @@ import numpy as np
 
 from sms_online.pipeline.description import LOOSE, described, near_rows
 from sms_online.smoother.search import (
+    DERIVATIVES_INTERVAL,
     LARGEST_MEAN_SQUARE,
     NO_NUMBERS,
     DivergedError,
@@ -124,10 +125,17 @@ class SpanSmoother(SmoothedReadings):
 
     def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
         """From the start that leads to equations that hold, or else to those that hold best."""
+        inexact = list[Search]()
+        for interval in (DERIVATIVES_INTERVAL, FAST_INTERVAL):
+            for search in self._begun(span, beta, known, interval):
+                with suppress(*NO_NUMBERS):
+                    if (fit := search.exact(LEVELS[1:], STEPS)) is not None:
+                        return fit
+                    inexact.append(search)
         fits, why = list[SpanFit](), "neither the balance's fit nor the description leads to the samples"
-        for search in self._begun(span, beta, known):
+        for search in inexact:
             try:
-                fit = search.through(LEVELS[1:], STEPS)
+                fit = search.allowing()
             except NO_NUMBERS as error:
                 why = str(error)
                 continue
@@ -143,17 +151,17 @@ class SpanSmoother(SmoothedReadings):
             raise DivergedError(why)
         return min(fits, key=lambda each: each.inexact)
 
-    def _begun(self, span: Span, beta: Array, known: Array) -> Iterator[Search]:
+    def _begun(self, span: Span, beta: Array, known: Array, interval: float) -> Iterator[Search]:
         """Searches at the first level, from β (n,) and from the description; first what leads near to the samples.
 
-        From the description what loose equations do not determine is to stay near it.
+        From the description what loose equations do not determine is to stay near it. interval: see `Search`.
         """
         later = []
         value, size = described(self.model, self.base)
         start_anew = np.concatenate((beta[: self.m], value)), np.concatenate((np.zeros(self.m), size))
         for start, reach in ((beta, None), start_anew):
             try:
-                search = Search(self, span, start, known, reach)
+                search = Search(self, span, start, known, reach, interval=interval)
                 search.loosen(LEVELS[0])
             except NO_NUMBERS:
                 continue

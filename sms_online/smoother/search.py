@@ -45,6 +45,8 @@ FREE_POSITION = 10.0
 # standard deviations: the error of the last one is a sixteenth of that change, as its order is four.
 ROUGH_STEP = 0.01
 REFINED = 1.0
+# Share of the mean square that steps of half the length leave, at most, where it is those that are too long.
+OF_STEPS = 0.5
 # A step of the search that moves no parameter by more standard deviations than this ends it: the next one would be
 # smaller by far, as the convergence is quadratic near the end.
 CONVERGED = 0.5
@@ -161,6 +163,7 @@ class Search:
         self._fixed = False
         self.beta = beta
         self.std, self.factor = np.full(beta.size, np.inf), np.zeros((beta.size + 1, beta.size + 1))
+        self._size = ROUGH_STEP  # of the collocation's steps, as they are asked for
         self.mean_square = np.inf
         self._asked, self._relaxation, self._torque_noise = np.zeros(beta.size), 1.0, smoother.torque_noise
         t = span.nodes(ROUGH_STEP)
@@ -195,49 +198,63 @@ class Search:
         self._known = np.column_stack((np.diag(1.0 / unit), self.beta / unit))
 
     def through(self, levels: Sequence[float], steps: Sequence[float], exactly: bool = False) -> SpanFit:
-        """The fit, by way of white forces of so many levels; see `tightened`."""
-        for level in levels:
-            self.loosen(level)
-        return self.tightened(steps, exactly)
-
-    def tightened(self, steps: Sequence[float], exactly: bool = False) -> SpanFit:
-        """The fit with equations that hold, or that hold as well as the samples allow.
+        """The fit, by way of white forces of so many levels, with equations that hold as well as the samples allow.
 
         exactly: they are to leave no more than noise; else DivergedError.
         """
+        if (fit := self.exact(levels, steps, exactly)) is not None:
+            return fit
+        if exactly:
+            raise DivergedError("samples do not agree with the equations of motion")
+        return self.allowing()
+
+    def exact(self, levels: Sequence[float], steps: Sequence[float], strictly: bool = False) -> SpanFit | None:
+        """The fit with equations that hold, None where samples do not agree with any; see `through`.
+
+        strictly: it is to converge, and to leave no more than noise.
+        """
+        for level in levels:
+            self.loosen(level)
         for k, step in enumerate(steps):
             self.refine(step)
-            before = self.beta, self.motion
-            if not self.converge(0.0, strictly=exactly):
+            self._size = step
+            self._rough = before = self.beta, self.motion
+            left = self.mean_square
+            if not self.converge(0.0, strictly=strictly):
+                break
+            if k and self.mean_square > max(LARGEST_MISFIT, OF_STEPS * left):
                 break
             if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
                 break
-        if self.mean_square <= (LARGEST_MEAN_SQUARE if exactly else LARGEST_MISFIT):
-            return self._taken(0.0, step)
-        if exactly:
-            raise DivergedError("samples do not agree with the equations of motion")
+        fits = self.mean_square <= (LARGEST_MEAN_SQUARE if strictly else LARGEST_MISFIT)
+        return self._taken(0.0) if fits else None
+
+    def allowing(self) -> SpanFit:
+        """The fit that allows for as much as samples need that do not agree with exact equations."""
         least, near = self._torque_noise, None
         for self._torque_noise in (times for times in TORQUE_NOISE if times > least):
             if not np.isfinite(self.mean_square):
-                self.beta, self.motion = before
+                self.beta, self.motion = self._rough
             if self.converge(0.0) and self.mean_square <= LARGEST_MISFIT:
-                near = self._taken(0.0, step)
+                near = self._taken(0.0)
                 if self.mean_square <= LARGEST_MEAN_SQUARE:
                     break
         if near is not None:
             return near
         self._torque_noise = least
         for level in ALLOWED:
-            self.beta, self.motion = before
+            self.beta, self.motion = self._rough
             if self.converge(level) and self.mean_square <= LARGEST_MEAN_SQUARE:
-                return self._taken(level, step)
+                return self._taken(level)
         raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
 
-    def _taken(self, level: float, step: float) -> SpanFit:
+    def _taken(self, level: float) -> SpanFit:
         """The fit as it is, with error bars as wide as the innovations are beyond their noise."""
         beyond = self.mean_square if self.mean_square > LARGEST_MEAN_SQUARE else 1.0
         factor = self.factor / np.sqrt(beyond)
-        return SpanFit(factor, self.beta, self.rows, self.mean_square, level, self._torque_noise, step, self.ending)
+        return SpanFit(
+            factor, self.beta, self.rows, self.mean_square, level, self._torque_noise, self._size, self.ending
+        )
 
     def loosen(self, level: float) -> None:
         """Follow the samples with white forces of a level."""
