@@ -42,7 +42,7 @@ def changed_session(before: Simulation, after: System, change: float, duration: 
     return Block(np.arange(len(x)) / rate, plant.channels, plant.channel_values(torque, x))
 
 
-def noisy(system: System, exact: Block, grade: str, seed: int) -> Block:
-    """The samples with a grade's sensor noise."""
+def noisy(system: System, exact: Block, grade: str | None, seed: int) -> Block:
+    """The samples with a grade's sensor noise, or the described one."""
     sensors = Sensors(system, exact.channels, grade, seed)
     return Block(exact.t, exact.channels, sensors.read(0, exact.values))

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from sms_online.description.schema import LEAST_SQUARES, System
+from sms_online.description.schema import System
 from sms_online.effects.build import build_model, refuse_unknown_masses
-from sms_online.effects.catalogue import channel_effects
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import BaseParameters, find_base_parameters
 from sms_online.model.model import Model
@@ -33,7 +32,8 @@ from sms_online.pipeline.outliers import LeftOut, Outliers
 from sms_online.pipeline.preparation import Preparation
 from sms_online.pipeline.rates import RateSamples, RatesStage
 from sms_online.pipeline.relinearisation import Relinearisation
-from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, is_slow, not_smoothed, stated_period
+from sms_online.pipeline.sensing import AttitudeContinuity, Sensing, stated_period
+from sms_online.pipeline.smoother_choice import smoother_of, too_slow
 from sms_online.pipeline.statistics import Method, Setup
 from sms_online.pipeline.synchronise import GridSamples, SyncCounters, Synchroniser
 from sms_online.pipeline.tracker_bank import Reading, session_trackers
@@ -84,21 +84,7 @@ class Estimator(Stage):
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
         self.observers: list[Observer] = []
-        self.smoother: Smoother | None = None
-        # It reads the channels as they come.
-        distorted = channel_effects(system)
-        if distorted and self.sensing.missing and system.balance != "energy":
-            found = f"{distorted[0].name}@{distorted[0].where}, and no {self.sensing.missing[0]}"
-            raise InputError(source, "", found, 'balance = "energy", or all coordinates measured')
-        if self._needs_smoother and (refused := not_smoothed(model)):
-            raise InputError(source, "", refused, 'balance = "energy", or all coordinates measured fast enough')
-        if not distorted and self._needs_smoother:
-            from sms_online.smoother.session import Smoother  # which few sessions need
-
-            # Beside a momentum balance, which finds changes sooner, it looks for none.
-            changed = self._begin_joints if self.sensing.missing or self._slow else None
-            trackers = system.trackers or (LEAST_SQUARES,)
-            self.smoother = Smoother(model, base, self.sensing, channels, trackers, changed)
+        self.smoother = smoother_of(base, self.sensing, channels, source, self._begin_joints)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]
         self._smoothed_columns = [self.channels.index(name) for name in self._smoothed_channels]
@@ -113,7 +99,9 @@ class Estimator(Stage):
         # sake of the lag.
         self._rates = RatesStage(system.sample_rate, *self.sensing.deciding)
         # A balance of forces does not hold in a shape that is not the link's; energies tolerate it best.
-        by_energy = system.balance == "energy" or self.sensing.missing or (self.smoother is not None and self._slow)
+        by_energy = (
+            system.balance == "energy" or self.sensing.missing or (self.smoother is not None and too_slow(self.sensing))
+        )
         self.trackers = session_trackers(self.sensing, not by_energy)
         if by_energy and self.smoother is None and not all(choice.static for choice in self.trackers):
             found = "a tracker of its own, and no momentum balance"
@@ -135,20 +123,6 @@ class Estimator(Stage):
     def momentum(self) -> Momentum | None:
         """The momentum balance, None where energies alone are balanced; another one where it is relinearised."""
         return None if self._relinearisation is None else self._relinearisation.momentum
-
-    @property
-    def _needs_smoother(self) -> bool:
-        """Whether states are to be estimated with the parameters: asked for, or for want of sensors or of samples."""
-        system = self.system
-        if system.balance != "both":
-            return system.balance == "smoother" or (system.balance == "momentum" and bool(self.sensing.missing))
-        return bool(self.sensing.missing) or self._slow
-
-    @property
-    def _slow(self) -> bool:
-        """Whether a position sensor is described as too slow for the windows of the momentum balance."""
-        positions = tuple(self.sensing.channels[k] for k in self.sensing.position_columns)
-        return is_slow(stated_period(self.system, positions), self.system.windows.momentum)
 
     def renew(self) -> None:
         """See Stage."""
@@ -228,15 +202,12 @@ class Estimator(Stage):
 
     @property
     def by_smoother(self) -> bool:
-        """Whether the estimate comes from the smoother, which holds as long as nothing changes."""
+        """Whether the estimate comes from the smoother: beside a momentum balance as long as nothing changes."""
         if self.smoother is None:
             return False
-        # Behind a change that nothing explains its estimate is that nothing is known.
-        return (
-            self.smoother.known.spans > 0
-            if self.momentum is not None and not self.events
-            else (self.momentum is None and (self.smoother.known.spans > 0 or bool(self.events)))
-        )
+        some = self.smoother.known.spans > 0
+        # Behind a change that nothing explains it knows that nothing is known.
+        return some or bool(self.events) if self.momentum is None else some and not self.events
 
     @property
     def by_momentum(self) -> bool:

@@ -16,13 +16,13 @@ from contextlib import contextmanager, suppress
 import numpy as np
 
 from sms_online.pipeline.description import LOOSE, described, near_rows
+from sms_online.smoother.readings import SmoothedReadings
 from sms_online.smoother.search import (
     DERIVATIVES_INTERVAL,
     LARGEST_MEAN_SQUARE,
     NO_NUMBERS,
     DivergedError,
     Search,
-    SmoothedReadings,
     SpanFit,
 )
 from sms_online.smoother.span import Ending, Span
