@@ -57,7 +57,9 @@ def reported(estimator: Estimator, block: Block) -> list[tuple[float, Event]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", CHANGED)
+@pytest.mark.parametrize(
+    "kind", ["payload", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("stiffness", "friction"))]
+)
 def test_a_change_is_named_with_its_size(kind: str) -> None:
     block = changing(kind)
     estimator = Estimator(BENCH, block.channels, "points")
@@ -74,7 +76,7 @@ def test_a_change_is_named_with_its_size(kind: str) -> None:
         assert abs(value - truth.get(p.name, SIZES.get(p.name, np.nan))) < 4.0 * deviation, p.name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_session_behind_a_change_is_resumed_to_the_same_bits() -> None:
     block = changing("payload")
     whole = session_of(BENCH, [block])
@@ -103,7 +105,7 @@ def test_a_change_at_the_end_leaves_the_estimate_of_before() -> None:
     assert np.all(np.abs(normalised(estimator)) < 4.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_trackers_follow_what_drifts() -> None:
     data = sms.simulate(BENCH, 32.0, seed=1, drift=["joint_1.damping:share=0.02,over=20,begin=12"])
     trackers = ["kalman:drift=random_walk,share=0.001", "rls:forgetting=window,memory=4", "rls"]

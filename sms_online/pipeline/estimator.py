@@ -84,6 +84,8 @@ class Estimator(Stage):
         self._base = base = find_base_parameters(model)
         self.sensing = Sensing(model, channels, source)
         self.observers: list[Observer] = []
+        # Put back first: it knows the time of an event.
+        self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         self.smoother = smoother_of(base, self.sensing, channels, source, self._begin_joints)
         self.channels = tuple(dict.fromkeys((*self.sensing.channels, *self._smoothed_channels)))
         self._columns = [channels.index(name) for name in self.channels]
@@ -93,7 +95,6 @@ class Estimator(Stage):
         sensors = [k for k, name in enumerate(self.channels) if not name.startswith(("tau_", "force_", "wrench_"))]
         self._outliers = Outliers(len(self.channels), sensors)
         self._attitude = AttitudeContinuity()
-        self._synchroniser = Synchroniser(self.sensing.channels, system.sample_rate)
         self._preparation = Preparation(model, self.sensing)
         # Positions choose the filter's width, as far as their noise is a sensor's; torques pass the same filter for the
         # sake of the lag.

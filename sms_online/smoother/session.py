@@ -278,7 +278,7 @@ class Smoother(Stage):
 
     def _adopt(self, step: Step, change: tuple[float, float], count: int, first_fit: Callable[[], Estimate]) -> bool:
         """Go on with parameters that have jumped, from the span behind it; whether its samples agree with that."""
-        now, problem, past = self.state, self._problem, self.known
+        now, problem, past, prior = self.state, self._problem, self.known, self.current_prior
         added = [*now.added, *step.fresh]
         self._problem = self._changes.problem(added)
         names = [p.name for p in self.base.parameters]
@@ -287,7 +287,7 @@ class Smoother(Stage):
         beta[jumped] += step.explanation.sizes
         known = Information(past.factor, past.rows).widened(len(step.fresh)).without(jumped)
         now.known = past._replace(factor=known.factor, beta=beta, blocks=())
-        self._add_event(step.kind, change, step)
+        self._add_event(step.kind, change, step.names)
         fit = self._fitted(count, first_fit)
         if isinstance(fit, DivergedError) or contradicts(self._beforehand, fit):
             self._problem, now.known, now.events = problem, past, now.events[:-1]
@@ -297,6 +297,7 @@ class Smoother(Stage):
         begin, end, _, _ = self.gathered.span(count)
         self._take(fit, begin, end)
         now.before = now.known
+        self._measure(past.estimate(prior))
         return True
 
     def _begin_behind(self) -> None:
@@ -305,13 +306,23 @@ class Smoother(Stage):
         self.trackers = self._new_trackers()
         self.trackers.begin(Information(self.known.factor, self.known.rows))
 
-    def _add_event(self, kind: str, change: tuple[float, float], step: Step | None = None) -> None:
-        event = Event(0.5 * (change[0] + change[1]), kind, (), (), (), (), LEFT_OUT)
-        if step is not None:
-            units, found = {p.name: p.unit for p in self.base.parameters}, step.explanation
-            of_names, sizes, stds = (units[name] for name in step.names), found.sizes.tolist(), found.stds.tolist()
-            event = replace(event, parameters=step.names, units=tuple(of_names), sizes=tuple(sizes), stds=tuple(stds))
+    def _add_event(self, kind: str, change: tuple[float, float], names: tuple[str, ...] = ()) -> None:
+        event = Event(0.5 * (change[0] + change[1]), kind, names, (), (), (), LEFT_OUT)
         self.state.events = [*self.state.events, event]
+
+    def _measure(self, before: Estimate) -> None:
+        """Add to the last event by how much its parameters are other than in an estimate from before it."""
+        now, event = self.known.estimate(self.current_prior), self.state.events[-1]
+        # There was nothing of what is new.
+        value, std = (np.pad(each, (0, now.pi.size - each.size)) for each in (before.pi, before.std))
+        columns = [[p.name for p in self.base.parameters].index(name) for name in event.parameters]
+        measured = replace(
+            event,
+            units=tuple(self.base.parameters[k].unit for k in columns),
+            sizes=tuple((now.pi - value)[columns].tolist()),
+            stds=tuple(np.hypot(now.std, std)[columns].tolist()),
+        )
+        self.state.events = [*self.state.events[:-1], measured]
 
     def estimate(self) -> Estimate:
         """The base parameters as the judged tracker knows them now, with the prior; only after the first span."""
