@@ -108,8 +108,7 @@ class Smoother(Stage):
 
     def _new_trackers(self) -> SpanTrackers:
         name, parameters = self.model.system.name, self.base.parameters
-        prior = self.current_prior if self.prior is not None else None
-        return SpanTrackers(self._choices, name, parameters, self.nuisances, prior, NEXT_SPAN)
+        return SpanTrackers(self._choices, name, parameters, self.nuisances, self.current_prior, NEXT_SPAN)
 
     @property
     def model(self) -> Model:
@@ -257,7 +256,9 @@ class Smoother(Stage):
         assert change is not None
         now.change = None
         if step is not None and not step.explanation.needed:
-            # Nothing has changed.
+            # It did not last.
+            failure = f"{change[0]:.6g} … {change[1]:.6g} s: samples agree with those before and behind, not there"
+            now.known = past._replace(failures=(*past.failures, failure))
             return False
         if step is not None and step.explains and self._adopt(step, change, count, first_fit):
             return True
