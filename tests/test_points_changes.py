@@ -48,9 +48,10 @@ def rubbing(system: System, effect: str) -> System:
     return system.model_copy(update={"effects": (parse_effect(effect, system),)})
 
 
+# Lighter bodies at the undamped tip ring at frequencies that the collocation does not resolve, see docs.
 # Before and behind each change, its kind, and the parameter that says most of it.
 CHANGES = {
-    "one link, 0.5 kg": (BENCH, carrying(BENCH, 0.5, 0.06), "payload", "payload.mass"),
+    "one link, 0.5 kg": (BENCH, carrying(BENCH, 0.5, 0.2), "payload", "payload.mass"),
     "one link, spring -5 %": (BENCH, joint_of(BENCH, 0, stiffness=0.95), "stiffness", "joint_1.stiffness"),
     "one link, 2 N m": (
         BENCH, rubbing(BENCH, "coulomb_friction@joint_1:torque=2"), "friction", "coulomb_friction@joint_1.torque",

@@ -83,13 +83,13 @@ class SpanSmoother(SmoothedReadings):
     ) -> SpanFit:  # fmt: skip
         """Fit a span from β (n,), with what is known before it as a factor or rows (·, n + 1).
 
-        last_step: of the collocation of an earlier span, s; None in the first one. before: of the span that this one
-        goes on from. Raises DivergedError; exactly: also where a span that is not the first does not agree with the
+        last_step: of the collocation of an earlier span, s; None where none is known to be fine enough. before: of the
+        span that this one goes on from. Raises DivergedError; exactly: also where samples do not agree with the
         equations of motion.
         """
         with diverging():
             if last_step is None:
-                return self._first(span, beta, known)
+                return self._first(span, beta, known, exactly)
             if before is not None:
                 with suppress(*NO_NUMBERS):
                     search = Search(self, span, beta, known, before=before)
@@ -123,7 +123,7 @@ class SpanSmoother(SmoothedReadings):
                     return search
         raise DivergedError("no motion explains the samples, whatever forces act")
 
-    def _first(self, span: Span, beta: Array, known: Array) -> SpanFit:
+    def _first(self, span: Span, beta: Array, known: Array, exactly: bool) -> SpanFit:
         """From the start that leads to equations that hold, or else to those that hold best."""
         inexact = list[Search]()
         for interval in (DERIVATIVES_INTERVAL, FAST_INTERVAL):
@@ -132,6 +132,8 @@ class SpanSmoother(SmoothedReadings):
                     if (fit := search.exact(LEVELS[1:], STEPS)) is not None:
                         return fit
                     inexact.append(search)
+        if exactly:
+            raise DivergedError("samples do not agree with the equations of motion")
         fits, why = list[SpanFit](), "neither the balance's fit nor the description leads to the samples"
         for search in inexact:
             try:

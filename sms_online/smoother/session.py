@@ -216,7 +216,7 @@ class Smoother(Stage):
         try:
             smoother, span = self._span_problem(count)
             beta = past.beta if np.isfinite(past.beta).all() else self._beginning(first_fit)
-            last_step = past.last_step if past.spans else None
+            last_step = past.last_step if np.isfinite(past.last_step) else None
             return smoother.fit(span, beta, self._beforehand, last_step, self.state.ending, self._settled)
         except DivergedError as error:
             return error
@@ -287,7 +287,8 @@ class Smoother(Stage):
         beta = np.concatenate((step.explanation.beta, np.zeros(len(step.fresh))))
         beta[jumped] += step.explanation.sizes
         known = Information(past.factor, past.rows).widened(len(step.fresh)).without(jumped)
-        now.known = past._replace(factor=known.factor, beta=beta, blocks=())
+        # With what is carried modes are faster, and may need finer steps.
+        now.known = past._replace(factor=known.factor, beta=beta, blocks=(), last_step=np.nan)
         self._add_event(step.kind, change, step.names)
         fit = self._fitted(count, first_fit)
         if isinstance(fit, DivergedError) or contradicts(self._beforehand, fit):

@@ -59,7 +59,7 @@ class SmootherStatistics(NamedTuple):
             beta=fit.beta,
             rows=self.rows + fit.rows,
             rss=self.rss + fit.rows * fit.mean_square,
-            last_step=self.last_step if self.spans else fit.step,
+            last_step=self.last_step if np.isfinite(self.last_step) else fit.step,
             end=end,
             lost=lost,
             torque_noise=max(self.torque_noise, fit.torque_noise),
