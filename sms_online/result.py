@@ -213,7 +213,7 @@ class Result(Documented):
     how many samples were left out, by channel. duration: s. condition_number: of the scaled information, inf without
     full rank. throughput: samples/s of computing time. calibration: what the description is off by, estimated better
     than its tolerances. trackers: what each says, the judged one, whose estimate `parameters` holds, first; empty where
-    no momentum balance gives the estimate.
+    the energy balance gives the estimate, or the smoother by its own least squares alone.
     physical: None of a session that still runs. diagnosis: episodes of the running diagnosis, as in results.json.
     history: of the estimates of each tracker, the judged one first. covariance (n, n): of the parameters, in their
     order, with the deviations that are reported; NaN of what is not determined.

@@ -200,7 +200,9 @@ class Tolerances(Record):
 
 
 class TrackerChoice(Record):
-    """A tracker of the momentum balance's rows. Of several `[[tracker]]` tables the first gives the judged estimate.
+    """A tracker of the rows of the momentum balance, or of the smoother.
+
+    Of several `[[tracker]]` tables the first gives the judged estimate.
 
     kind: `rls`, recursive least squares, or `kalman`, a Kalman filter in which parameters may drift; or another that
     `sms_online/trackers/build.py` lists.
