@@ -87,13 +87,10 @@ def true_values(system: System) -> dict[str, float]:
     return {p.name: p.nominal for p in build_model(system).parameters}
 
 
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.long if k else pytest.mark.slow) for k, case in enumerate(CHANGES)]
-)
-def test_a_change_is_named_with_its_size(case: str) -> None:
+def check_named(case: str, described: System, block: Block) -> None:
+    """That the only event of a session is the change of a case, with its size, and the parameters behind it hold."""
     before, after, kind, name = CHANGES[case]
-    block = changing(case)
-    estimator = Estimator(before, block.channels, "points")
+    estimator = Estimator(described, block.channels, "points")
     ((at, event),) = reported(estimator, block)
     assert event.kind == kind
     assert abs(event.time - CHANGE) <= 1.0
@@ -105,6 +102,19 @@ def test_a_change_is_named_with_its_size(case: str) -> None:
     truth = true_values(after)
     expected = base.values(np.array([truth.get(p.name, 0.0) for p in estimator.model.parameters]))
     assert np.all(np.abs(now.pi - expected) < 4.0 * now.std)
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.long if k else pytest.mark.slow) for k, case in enumerate(CHANGES)]
+)
+def test_a_change_is_named_with_its_size(case: str) -> None:
+    check_named(case, CHANGES[case][0], changing(case))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", [case for case in CHANGES if case.startswith("planar")])
+def test_a_change_is_named_where_readings_are_off(case: str) -> None:
+    check_named(case, *readings_off(CHANGES[case][0], changing(case), 1))
 
 
 @pytest.mark.long

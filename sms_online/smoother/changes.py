@@ -31,16 +31,16 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.smoother.fit import diverging
 from sms_online.smoother.gatherer import Gatherer
 from sms_online.smoother.problem import SpanProblem
-from sms_online.smoother.search import LARGEST_MEAN_SQUARE, DivergedError, Search, SpanFit
+from sms_online.smoother.search import EVERY_NODE, LARGEST_MEAN_SQUARE, DivergedError, Search, SpanFit
 from sms_online.stream import Array
 from sms_online.trackers import factor as factors
 
 # A span contradicts what is known where χ² of its rows exceeds its expectation by so many standard deviations.
 ALARM = 15.0
 # Levels of the white forces by which the samples behind a change are followed, ever tighter, and steps at each: what
-# has jumped is found roughly first. From FINE on steps of the collocation are of FINE_STEP, s.
+# has jumped is found roughly first. And the steps of the collocation, s: what has jumped may have made modes faster.
 LEVELS, ADVANCES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001, 0.0), 2
-FINE, FINE_STEP = 0.003, 0.005
+STEP = 0.005
 # A payload's inertia is hard to find from nothing: it is looked for from one of such shares of the heaviest link's
 # mass, too, with a radius of gyration of such a share of the longest link. What is left of one that is released is
 # looked for from such a share of it.
@@ -121,7 +121,8 @@ class SpanChanges:
         carried = [m + k for k, p in enumerate(base.parameters) if p.name.startswith("payload.")]
         for start in [past, *_with_payloads(past, carried, base, system)]:
             with suppress(DivergedError):
-                tried.append(_tightened(Search(smoother, span, start, np.empty((0, start.size + 1))), known[0], jumps))
+                search = Search(smoother, span, start, np.empty((0, start.size + 1)), interval=EVERY_NODE)
+                tried.append(_tightened(search, known[0], jumps))
                 if tried[-1][0] <= EXPLAINED:
                     break
         if not tried:
@@ -140,9 +141,8 @@ def _tightened(search: Search, known: Array, jumps: list[Jump]) -> tuple[float, 
     n = len(known) - 1
     beta = search.beta
     with diverging():
+        search.refine(STEP)
         for level in LEVELS:
-            if level <= FINE:
-                search.refine(FINE_STEP)
             search.hold(beta)
             for _ in range(ADVANCES):
                 search.advance(level)

@@ -19,6 +19,7 @@ from sms_online.pipeline.description import LOOSE, described, near_rows
 from sms_online.smoother.readings import SmoothedReadings
 from sms_online.smoother.search import (
     DERIVATIVES_INTERVAL,
+    EVERY_NODE,
     LARGEST_MEAN_SQUARE,
     NO_NUMBERS,
     DivergedError,
@@ -41,10 +42,9 @@ NEARLY_EXACT = (0.0, 3.0)
 # motion. And how far parameters may be from the description then, as a share of it, 1σ: held, where they run away.
 FOLLOWING = (3.0, 1.0, 0.3, 0.1)
 NEAR, HELD = 0.5, 1e-4
-# Steps of the collocation, s, ever finer. Where a motion is too fast for those of the spans before: a share of them,
-# and the interval of the derivatives, s.
+# Steps of the collocation, s, ever finer. Where a motion is too fast for those of the spans before: a share of them.
 STEPS = (0.005, 0.0025, 0.00125)
-FINER, FAST_INTERVAL = 0.5, 0.01
+FINER = 0.5
 
 
 @contextmanager
@@ -98,7 +98,7 @@ class SpanSmoother(SmoothedReadings):
                 return Search(self, span, beta, known).through(LATER_LEVELS, (last_step,), exactly)
             try:
                 # The motion may be too fast for such steps and derivatives.
-                search = Search(self, span, beta, known, interval=FAST_INTERVAL)
+                search = Search(self, span, beta, known, interval=EVERY_NODE)
                 search.refine(last_step)
                 return search.through(LATER_LEVELS, (last_step, FINER * last_step), exactly)
             except NO_NUMBERS:
@@ -126,7 +126,7 @@ class SpanSmoother(SmoothedReadings):
     def _first(self, span: Span, beta: Array, known: Array, exactly: bool) -> SpanFit:
         """From the start that leads to equations that hold, or else to those that hold best."""
         inexact = list[Search]()
-        for interval in (DERIVATIVES_INTERVAL, FAST_INTERVAL):
+        for interval in (DERIVATIVES_INTERVAL, EVERY_NODE):
             for search in self._begun(span, beta, known, interval):
                 with suppress(*NO_NUMBERS):
                     if (fit := search.exact(LEVELS[1:], STEPS)) is not None:

@@ -47,14 +47,17 @@ OF_STEPS = 0.5
 # smaller by far, as the convergence is quadratic near the end.
 CONVERGED = 0.5
 MAX_STEPS = 16
-# Derivatives by displacements are computed that often as a rule, s.
-DERIVATIVES_INTERVAL = 0.04
+# Derivatives by displacements are computed that often as a rule, s; or at every node, where the motion is fast or
+# begins far from the samples.
+DERIVATIVES_INTERVAL, EVERY_NODE = 0.04, 0.0
 # Mean square of the whitened innovations that noise alone may leave: a span of some seconds scatters by a hundredth,
 # the noise behind it is estimated to a tenth.
 LARGEST_MEAN_SQUARE = 1.2
 # Mean square up to which exact equations are kept: friction that follows its law roughly leaves twice the noise. Beside
 # noise of the torques that would explain it, the scale of all parameters would be uncertain.
 LARGEST_MISFIT = 4.0
+# And from which on loose equations refute what is known: exact ones that leave little but noise will not be met.
+REFUTED = 100.0
 # Directions of β with less information than this share of the best one's, in units of the columns' sizes, are left
 # as they are: derivatives are good to 1e-8.
 RANK_TOLERANCE = 1e-8
@@ -175,6 +178,8 @@ class Search:
         """
         for level in levels:
             self.loosen(level)
+            if strictly and self.mean_square > REFUTED:
+                return None
         for k, step in enumerate(steps):
             self.refine(step)
             self._size = step
