@@ -186,7 +186,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.long)])
 def test_a_stopped_run_takes_its_workers_with_it(tmp_path: Path, number: int) -> None:
     log = tmp_path / "log"
     log.touch()

@@ -152,7 +152,7 @@ def test_rows_are_whitened_by_the_session_s_parameters_where_these_leave_noise()
     assert np.any(lacking.rows.beta != lacking.case.session.estimate().pi)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_perfect_model_with_noisy_torques_is_clean() -> None:
     """Torques fix the scale of all masses weakly, and noise in the columns would attenuate it by 13 deviations."""
     system = sms.load_system("paper-planar")

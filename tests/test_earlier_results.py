@@ -130,7 +130,7 @@ def test_what_drifts_leaves_its_prior_without_a_dispute(first: sms.Result) -> No
     assert found.trust.level == "trust"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_prior_counts_once_beside_a_drift() -> None:
     """Nearly all that is known of the damping is the prior's, and so is its deviation."""
     name, std = "viscous_friction@joint_1.damping", 2e-6

@@ -106,6 +106,7 @@ def samples(session: Session) -> int:
     return len(path.read_text().splitlines()) if path.is_file() else 0
 
 
+@pytest.mark.long
 def test_a_killed_arm_is_named_and_followed_when_it_moves_again(
     tmp_path: Path, started: list[subprocess.Popen[Any]]
 ) -> None:
@@ -167,7 +168,8 @@ def start_viewer() -> tuple[subprocess.Popen[bytes], str]:
     return viewer, f"127.0.0.1:{port}"
 
 
-@pytest.mark.parametrize("killed", [pytest.param("view", marks=pytest.mark.long), "viewer"])
+@pytest.mark.long
+@pytest.mark.parametrize("killed", ["view", "viewer"])
 def test_a_killed_view_is_named_and_the_session_goes_on(
     tmp_path: Path, started: list[subprocess.Popen[Any]], killed: str
 ) -> None:

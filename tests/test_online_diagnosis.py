@@ -125,7 +125,7 @@ def test_an_effect_from_the_start_is_named_and_leaves_no_bias() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rest", [2.0, 10.0])
+@pytest.mark.parametrize("rest", [2.0, pytest.param(10.0, marks=pytest.mark.long)])
 def test_friction_behind_a_rest_is_named_as_by_rls(rest: float) -> None:
     """Rows at rest show neither a drift nor what the model lacks: no motion that follows them is an event."""
     block = rested(rest)

@@ -40,8 +40,8 @@ def started(tmp_path: Path) -> Iterator[list[subprocess.Popen[Any]]]:
 
 
 def tier(verb: str, mode: str) -> tuple[pytest.MarkDecorator, ...]:
-    """Of a verb with a view: a live session and served pages, whose ports are the usual ones, are for themselves."""
-    if (verb, mode) == ("live", "save") or mode == "serve":
+    """Of a verb with a view: served pages, whose ports are the usual ones, are for themselves."""
+    if mode == "serve":
         return (pytest.mark.realtime,)
     return () if (verb, mode) == ("demo", "save") else (pytest.mark.long,)
 

@@ -150,7 +150,7 @@ def document(directory: Path) -> dict[str, Any]:
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_a_stopped_live_session_replays_to_the_same_results(
     arm: tuple[SimulatedArm, Path], tmp_path: Path, number: signal.Signals
 ) -> None:

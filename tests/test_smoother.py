@@ -200,8 +200,8 @@ def test_inexplicable_samples_leave_the_first_fit_and_a_warning(simulation: Simu
     assert any("bend quasi-statically" in warning for warning in document["warnings"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("noise", [0.015, *(pytest.param(noise, marks=pytest.mark.long) for noise in (0.05, 0.1))])
+@pytest.mark.long
+@pytest.mark.parametrize("noise", [0.015, 0.05, 0.1])
 def test_coloured_noise_of_a_torque_is_allowed_for(simulation: Simulation, noise: float) -> None:
     """Correlated over 50 samples, 2, 7 and 14 % of the torque: it does not show from sample to sample. Seed 0.
 

@@ -107,7 +107,9 @@ def test_a_snapshot_shares_arrays_and_no_lists() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["gap", "effects", "smoother", "recording", "axis-event"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("gap", marks=pytest.mark.long), "effects", "smoother", "recording", "axis-event"]
+)
 def test_a_session_resumed_repeatedly_ends_in_the_same_state(name: str) -> None:
     """At eight places by seed 1, in every bit of every stage's state: so no state lacks what the stage goes on with.
 

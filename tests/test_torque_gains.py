@@ -79,7 +79,7 @@ def with_unknown_gain(system: System) -> System:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ripple", [0.0, 0.05])
+@pytest.mark.parametrize("ripple", [pytest.param(0.0, marks=pytest.mark.long), 0.05])
 def test_an_unknown_gain_makes_no_torque_vanish(arm: System, ripple: float) -> None:
     """8 s at grade B, seed 1; a ripple of both torques that nobody describes, a share of them."""
     effects = [f"torque_gain@joint_2:ratio={GAIN}"]
@@ -110,7 +110,7 @@ def test_a_known_value_fixes_the_scale_only_where_nothing_acts_alike(arm: System
     assert not scale_is_open(arm, motor_2__rotor_inertia=2.4e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_cannot_fix_the_scale_changes_no_estimate(arm: System) -> None:
     """A link's mass that acts as its inertia does: joint 1's gain stays the unit of all others, and results say so."""
     data = sms.simulate(arm, grade="B", seed=2)
@@ -140,7 +140,7 @@ def test_gains_that_a_session_finds_hold_on_another_run(arm: System) -> None:
     assert handed_on.joints["joint_2"].left != plain.joints["joint_2"].left
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_gain_of_joint_1_is_held_where_the_scale_is_fixed(arm: System) -> None:
     """A torque of joint 1 that reads 4 % too large, and a result that says so."""
     system = arm.model_copy(update={"known": {"motor_2.rotor_inertia": 2.4e-5}})

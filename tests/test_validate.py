@@ -190,7 +190,7 @@ def test_deflections_are_part_of_the_verdict(deflection: Predicted, verdict: str
     assert ("elastic force of link_1" in found.sentence) == (verdict != "hold")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rigidities_that_are_off_do_not_hold_where_torques_do() -> None:
     system = sms.load_system("paper-planar")
     capture = sms.simulate(system, duration=6.0, grade="A", seed=1)
