@@ -24,7 +24,7 @@ from tests.changed_session import changed_session, noisy
 from tests.saved import resumed
 from tests.sessions_of import normalised, session_of
 
-BENCH, PLANAR = marked_bench(), seen_by_cameras("paper-planar")
+BENCH, PLANAR, SPATIAL = marked_bench(), seen_by_cameras("paper-planar"), seen_by_cameras("spatial-two-link")
 CHANGE, DURATION = 12.4, 19.0  # s
 DECIDED = 4.5  # s behind a change: its own span, those behind it, and what the pipeline holds back
 
@@ -64,6 +64,10 @@ CHANGES = {
     "planar, 5 N m": (
         PLANAR, rubbing(PLANAR, "coulomb_friction@joint_2:torque=5"), "friction", "coulomb_friction@joint_2.torque",
     ),
+    "spatial, 3 kg for 8 kg": (SPATIAL, carrying(SPATIAL, 3.0, 0.2), "payload", "payload.mass"),
+    # It moves faster behind it than the usual steps and derivatives follow.
+    "spatial, spring -30 %": (SPATIAL, joint_of(SPATIAL, 0, stiffness=0.7), "stiffness", "joint_1.stiffness"),
+    "spatial, damper +5 %": (SPATIAL, joint_of(SPATIAL, 0, damping=1.05), "damping", "joint_1.damping"),
 }  # fmt: skip
 QUICKEST = "one link, spring -5 %"
 

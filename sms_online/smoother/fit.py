@@ -95,10 +95,10 @@ class SpanSmoother(SmoothedReadings):
                     search = Search(self, span, beta, known, before=before)
                     return search.through(NEXT_LEVELS, (last_step,), exactly)
             with suppress(*NO_NUMBERS):
-                return Search(self, span, beta, known).through(LATER_LEVELS, (last_step,), exactly)
+                return Search(self, span, beta, known, kept=exactly).through(LATER_LEVELS, (last_step,), exactly)
             try:
                 # The motion may be too fast for such steps and derivatives.
-                search = Search(self, span, beta, known, interval=EVERY_NODE)
+                search = Search(self, span, beta, known, interval=EVERY_NODE, kept=exactly)
                 search.refine(last_step)
                 return search.through(LATER_LEVELS, (last_step, FINER * last_step), exactly)
             except NO_NUMBERS:

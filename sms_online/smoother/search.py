@@ -56,8 +56,9 @@ LARGEST_MEAN_SQUARE = 1.2
 # Mean square up to which exact equations are kept: friction that follows its law roughly leaves twice the noise. Beside
 # noise of the torques that would explain it, the scale of all parameters would be uncertain.
 LARGEST_MISFIT = 4.0
-# And from which on loose equations refute what is known: exact ones that leave little but noise will not be met.
-REFUTED = 100.0
+# And from which on equations refute what is known, if a further step of the motion does not take it to less than half:
+# parameters whose exact equations leave little but noise will not be met.
+REFUTED, HALF = 100.0, 0.5
 # Directions of β with less information than this share of the best one's, in units of the columns' sizes, are left
 # as they are: derivatives are good to 1e-8.
 RANK_TOLERANCE = 1e-8
@@ -108,19 +109,20 @@ class Search:
 
     reach (n,): how far a step takes parameters that loose equations do not determine, as a standard deviation; 0 where
     that is not known. before: see `fit.SpanSmoother`. interval: from one computed derivative by displacements to the
-    next, s; between them they are interpolated, and only steer the search.
+    next, s; between them they are interpolated, and only steer the search. kept: parameters stay where they are while
+    equations are loose, as they do in a span that goes on from another.
     """
 
     def __init__(
         self, smoother: SmoothedReadings, span: Span, beta: Array, known: Array, reach: Array | None = None,
-        before: Ending | None = None, interval: float = DERIVATIVES_INTERVAL,
+        before: Ending | None = None, interval: float = DERIVATIVES_INTERVAL, kept: bool = False,
     ) -> None:  # fmt: skip
-        self._before, self._interval = before, interval
+        self._before, self._interval, self._kept = before, interval, kept or before is not None
         self.reach = np.zeros(beta.size) if reach is None else reach
         self._smoother, self._span, self._known = smoother, span, known
         self._model, self._base = smoother.model, smoother.base
         self.iterations = 0
-        # Whether nuisances stay where they are, and with them, where a span goes on from another, the parameters.
+        # Whether nuisances stay where they are, and with them the parameters that are kept.
         self._held = False
         # Whether all of β does.
         self._fixed = False
@@ -178,8 +180,11 @@ class Search:
         """
         for level in levels:
             self.loosen(level)
-            if strictly and self.mean_square > REFUTED:
-                return None
+            while strictly and self.mean_square > REFUTED:
+                left = self.mean_square
+                self.advance(level)
+                if self.mean_square > HALF * left:
+                    return None
         for k, step in enumerate(steps):
             self.refine(step)
             self._size = step
@@ -287,7 +292,7 @@ class Search:
         self.rows = len(Y)
         self.factor = triangular_factor(np.column_stack((Y, innovations[:, 0] + Y @ self.beta)))
         delta, solution = self._step(level)
-        if self._held and self._before is not None:
+        if self._held and self._kept:
             # From a motion that is roughly guessed a step would take what is known of the parameters far away.
             delta = np.zeros_like(delta)
         self._relax(delta)
