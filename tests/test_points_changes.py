@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -18,6 +19,7 @@ from sms_online.smoother.changes import ALARM, contradicts
 from sms_online.smoother.search import DivergedError, SpanFit
 from sms_online.smoother.span import Ending
 from sms_online.stream import Block
+from sms_online.verdict.gather import repeated
 from sms_sim.simulate import simulate
 from tests.camera_rig import marked_bench, readings_off, seen_by_cameras
 from tests.changed_session import changed_session, noisy
@@ -177,6 +179,16 @@ def test_trackers_follow_what_drifts() -> None:
     assert not result.events
 
 
+@pytest.mark.long
+def test_a_drift_that_nobody_follows_is_said() -> None:
+    data = sms.simulate(BENCH, 30.0, seed=1, drift=["joint_1.damping:share=0.05,over=16,begin=12"])
+    result = sms.estimate(BENCH, data)
+    assert {event.parameters for event in result.events} == {("joint_1.damping",)}
+    assert "joint_1.damping has jumped the same way" in result.trust.sentence
+    assert "kalman:drift=random_walk" in result.trust.next_step
+    assert not result.trust.grave
+
+
 def test_a_tracker_with_rates_is_refused() -> None:
     with pytest.raises(sms.InputError, match="drifts with a rate, of spans of samples; expected rls, or kalman"):
         sms.Session(BENCH, simulate_channels(), tracker="kalman:drift=learned")
@@ -190,6 +202,15 @@ def span_of(factor: np.ndarray, mean_square: float = 1.0, level: float = 0.0) ->
     n = len(factor) - 1
     ending = Ending(*np.zeros((3, n)), np.zeros((2, 2)), np.zeros((2, n)))
     return SpanFit(factor, np.zeros(n), 100, mean_square, level, 1.0, 0.005, ending)
+
+
+def test_jumps_of_one_kind_are_a_series_where_they_go_one_way() -> None:
+    first = Event(14.0, "damping", ("joint_1.damping",), ("N m s/rad",), (0.1,), (0.01,), 2)
+    other_way, other = replace(first, sizes=(-0.1,)), replace(first, parameters=("joint_1.stiffness",))
+    grasped = replace(first, kind="payload", parameters=("payload.mass",))
+    assert repeated([other, first, first, first]) == ("joint_1.damping",)
+    for events in ([first, first], [first, other_way, first], [first, other, first], 3 * [grasped]):
+        assert repeated(events) == ()
 
 
 def test_a_span_contradicts_what_it_is_far_from() -> None:

@@ -86,6 +86,7 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(evidence: Evidence, sai
     [
         (replace(GOOD, attenuated=("motor_2.mass",)), "noise biases motor_2.mass beyond the error bar"),
         (replace(GOOD, undecided=(19.2,)), "a change at 19.2 s"),
+        (replace(GOOD, repeated=("joint_1.damping",)), "joint_1.damping has jumped the same way several times"),
         (replace(GOOD, discrepancies=(Discrepancy("base", 3.0, "passed"),)), "exceeded its predicted noise for a time"),
         (replace(GOOD, distance=39.0), "the estimate violates physical consistency by 39 standard deviations"),
         (replace(GOOD, lost=0.2), "20 % of the samples are lost"),

@@ -59,6 +59,7 @@ class Evidence:
     alarm: type of the rows in which the sequential test finds more than noise, of a session without diagnosis.
     disputed: parameters that the data pull away from their prior.
     undecided: times, s, of changes that the session ended too early to decide on.
+    repeated: parameters that have jumped the same way in each of the last changes.
     distance: from the nearest physically consistent parameters, in standard deviations.
     comparison: with the values that the system file states.
     lost: share of the samples.
@@ -90,6 +91,7 @@ class Evidence:
     alarm: str | None = None
     disputed: tuple[Dispute, ...] = ()
     undecided: tuple[float, ...] = ()
+    repeated: tuple[str, ...] = ()
     distance: float = 0.0
     comparison: NominalComparison = AS_STATED
     lost: float = 0.0

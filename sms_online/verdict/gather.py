@@ -9,6 +9,8 @@ import numpy as np
 
 from sms_online.description.sources import source_channels
 from sms_online.evaluation import Evaluation
+from sms_online.pipeline.event_hypotheses import PAYLOAD
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.sensing import is_slow
 from sms_online.pipeline.statistics import Statistics
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 ROWS_A_PARAMETER = 10
 # Unexplained forces beside torques, times their noise, beyond which parameters are off by more than error bars say.
 LARGEST_TORQUE_NOISE = 3.0
+# Changes in a row of the same parameters that are a series.
+SERIES = 3
 # Tolerances that are none of the smoother's readings.
 NOT_SMOOTHED = ("length", "axis", "gravity", "gauge_low_pass", "base_angle", "truncation", "drive_gain", "drive_offset")
 
@@ -47,6 +51,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         alarm=None if momentum is None else momentum.alarm,
         disputed=tuple(disputes(evaluation)),
         undecided=tuple(event.time for event in now.events if event.kind == "undecided"),
+        repeated=repeated(now.events) if now.method == "smoother" else (),
         distance=0.0 if projection is None else projection.distance,
         comparison=evaluation.comparison,
         lost=_lost(now),
@@ -66,6 +71,15 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         consistency=trackers[0].consistency if trackers else None,
         scale=now.setup.system.scale_tolerance,
     )
+
+
+def repeated(events: Sequence[Event]) -> tuple[str, ...]:
+    """Names of the parameters that have jumped the same way in each of the last changes; not payloads, which add up."""
+    series = [event for event in events[-SERIES:] if event.kind != PAYLOAD]
+    if len(series) < SERIES:
+        return ()
+    ways = {(event.parameters, tuple(size > 0.0 for size in event.sizes)) for event in series}
+    return series[0].parameters if len(ways) == 1 else ()
 
 
 def _unconverged(evaluation: Evaluation) -> str:

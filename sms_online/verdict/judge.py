@@ -111,7 +111,7 @@ def _lasting(evidence: Evidence) -> Residuals:
 
 def _cautions(evidence: Evidence) -> list[Reason]:
     """What makes some of the numbers, or their error bars, worse than they look."""
-    out = [each for each in evidence.miscalibrated if not each.grave]
+    out = [*reasons.in_series(evidence.repeated), *(each for each in evidence.miscalibrated if not each.grave)]
     out += [*sample_reasons.troubled(evidence.troubles), *(each for each in evidence.weaknesses if not each.grave)]
     out += noisier(evidence.noisy, evidence.residual)
     out += [replace(each, grave=False) for each in _unnamed(evidence, noisy=True)]

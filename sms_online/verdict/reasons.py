@@ -49,6 +49,7 @@ MEASURE_SLOPES = "measure slopes of the links too: the momentum balance then inc
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
 WEIGH = "check torque constants and gear ratios, or weigh one part and state it under [known]"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
+WALK = "replay it with `--tracker kalman:drift=random_walk` (tracker = kalman, drift = random_walk)"
 LONGER = "record for longer: so few windows do not show whether it is noise of the torques or a force; else "
 OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
@@ -276,6 +277,15 @@ def moving(suspected: Suspected | None) -> list[Reason]:
     text = f"{names} {moves} to move since {suspected.since:.1f} s, and {are} not followed"
     where = place_of(suspected.parameters[0])
     return [Reason(text, False, where, "may move", then=GO_ON if suspected.learning else FOLLOW)]
+
+
+def in_series(parameters: Sequence[str]) -> list[Reason]:
+    """Parameters that jump the same way again and again: what drifts slowly is found so where spans are compared."""
+    if not parameters:
+        return []
+    have = "have" if len(parameters) > 1 else "has"
+    text = f"{listed(parameters)} {have} jumped the same way several times in a row, as what drifts does"
+    return [Reason(text, False, place_of(parameters[0]), "may drift", then=WALK)]
 
 
 def unwatched(duration: float) -> list[Reason]:
