@@ -323,6 +323,11 @@ def test_a_system_that_is_none_is_one_clear_line(system: Any, said: str) -> None
         sms.Session(system, block.channels)
 
 
+def test_a_capture_read_with_its_arguments_swapped_is_refused() -> None:
+    with pytest.raises(sms.InputError, match="an object of type System; expected the path of a recording first"):
+        sms.read_capture(sms.load_system("paper-planar"), "run.csv")  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

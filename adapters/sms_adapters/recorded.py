@@ -51,6 +51,9 @@ def read_capture(
     where that is given. start, stop: s after the first sample. InputError where it cannot be read, line and place
     named.
     """
+    if not isinstance(path, str | Path):
+        found = f"an object of type {type(path).__name__}"
+        raise InputError("path", "", found, "the path of a recording first, and then the system")
     path = Path(path)
     if system is not None:
         system, folder = given_system(system)
