@@ -24,21 +24,25 @@ class LaterController:
         return self._controller(t + self._elapsed, q, q_dot)
 
 
-def changed_session(before: Simulation, after: System, change: float, duration: float) -> Block:
+def changed_session(
+    before: Simulation, after: System, change: float, duration: float, back: float | None = None
+) -> Block:
     """Exact samples of `before` up to `change` (s), then of the system `after` up to `duration` (s).
 
-    Positions and speeds are continuous: what is grasped moves with the tip already. Internal states begin at rest.
+    From `back` (s) on they are of the first system again. Positions and speeds are continuous: what is grasped moves
+    with the tip already. Internal states begin at rest.
     """
     rate = after.sample_rate
-    samples = round(change * rate) + 1
-    start = exact_states(before, np.arange(samples) / rate)
-    plant = Plant(after)
-    plant.controller = LaterController(plant, change)  # type: ignore[assignment]
-    state = plant.state(start.x[-1], start.v[-1])
-    rest = duration - change
-    solution = solve(plant.rate, state, rest, tolerance(plant), longest=LONGEST_STEP)
-    end = exact_states(Simulation(plant, solution), np.arange(1, round(rest * rate) + 1) / rate)
-    x, torque = np.concatenate((start.x, end.x)), np.concatenate((start.torque, end.torque))
+    parts = [exact_states(before, np.arange(round(change * rate) + 1) / rate)]
+    later = [(after, change), *([] if back is None else [(before.plant.system, back)])]
+    for (system, begin), end in zip(later, [each for _, each in later[1:]] + [duration], strict=True):
+        plant = Plant(system)
+        plant.controller = LaterController(plant, begin)  # type: ignore[assignment]
+        state = plant.state(parts[-1].x[-1], parts[-1].v[-1])
+        solution = solve(plant.rate, state, end - begin, tolerance(plant), longest=LONGEST_STEP)
+        steps = round((end - begin) * rate)
+        parts.append(exact_states(Simulation(plant, solution), np.arange(1, steps + 1) / rate))
+    x, torque = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "torque"))
     return Block(np.arange(len(x)) / rate, plant.channels, plant.channel_values(torque, x))
 
 

@@ -126,6 +126,20 @@ def test_a_change_is_named_where_readings_are_off(case: str) -> None:
 
 
 @pytest.mark.long
+def test_what_is_grasped_and_released_leaves_what_was_before() -> None:
+    exact = changed_session(simulate(PLANAR, 28.0), carrying(PLANAR, 3.0, 0.2), CHANGE, 28.0, back=21.3)
+    described, block = readings_off(PLANAR, noisy(PLANAR, exact, None, 5), 2)
+    estimator = session_of(described, [block])
+    assert [event.kind for event in estimator.events] == ["payload", "payload"]
+    for event, mass in zip(estimator.events, (3.0, -3.0), strict=True):
+        mass_at = event.parameters.index("payload.mass")
+        assert abs(event.sizes[mass_at] - mass) < 4.0 * event.stds[mass_at] < 0.01
+    now, truth = estimator.estimate(), true_values(PLANAR)
+    expected = estimator.base.values(np.array([truth.get(p.name, 0.0) for p in estimator.model.parameters]))
+    assert np.all(np.abs(now.pi - expected) < 4.0 * now.std)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, 2])
 def test_nothing_changes_where_readings_are_off(seed: int) -> None:
     data = sms.simulate(PLANAR, 30.0, seed=seed)
