@@ -106,7 +106,7 @@ def test_a_described_lag_leaves_the_spring_beside_a_torque_that_wanders() -> Non
     assert abs(spring.value - K) < 3.0 * spring.std < 0.05 * K
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_friction_behind_the_spring_is_told_from_the_motor_s() -> None:
     """Both undeclared. The simulation rounds the motor's off below 0.02 rad/s, as presliding does."""
     found = sms.diagnose(bench(), session(None, COULOMB, bearing=2.0 * COULOMB))

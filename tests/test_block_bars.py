@@ -116,7 +116,7 @@ def test_bars_are_the_spread_of_fits_without_a_block() -> None:
     assert np.all((robust / spread > 1.05) & (robust / spread < 1.2))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_block_bars_hold_where_errors_last() -> None:
     """Intervals of 300 seeds by two parameters: 95 % within 93 to 98 %, three of their deviations; bars are rough."""
     held = []

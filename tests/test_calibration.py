@@ -167,7 +167,7 @@ def test_a_tracked_point_millimetres_off_is_corrected(exact: Block) -> None:
         assert each.estimate == pytest.approx(5e-3, abs=4.0 * each.std)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_saved_session_goes_on_where_rows_are_linear(exact: Block, very_late: Estimator) -> None:
     """Restored after its rows were made anew and while more of them may be."""
     block = noisy(exact, late(exact, 4e-3))

@@ -46,7 +46,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("verb", ["live", "record", pytest.param("replay", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "verb", ["live", *(pytest.param(verb, marks=pytest.mark.long) for verb in ("record", "replay"))]
+)
 def test_a_closed_terminal_ends_a_session_with_results(tmp_path: Path, terminal: tuple[int, int], verb: str) -> None:
     arguments, running, written, code = CASES[verb]
     described_testbed(tmp_path)

@@ -64,7 +64,7 @@ def test_a_step_and_a_drift_are_both_named(
     assert result.trust.level == "trust"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_line_of_a_young_drift_is_renewed_sooner() -> None:
     """Its rate is hardly known: rows of a second later, less such a line, would hold more than noise."""
     session = sms.Session(SYSTEM, ("force_1", "q_1"))
@@ -82,8 +82,8 @@ def test_the_line_of_a_young_drift_is_renewed_sooner() -> None:
     assert max(holds) <= LOOKED
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_weak_drift_after_a_long_steady_stretch_is_no_step(seed: int) -> None:
     """It had run for three seconds before the alarm; the next one is looked at as soon as ever."""
     data = axis_run(46.0, 34.0, 2.0 * SHARE, np.inf, False, seed)

@@ -17,8 +17,8 @@ DURATION = 10.0  # s, as in the paper
 LARGEST_ERROR = 1e-4
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper-planar", pytest.param("paper-planar-exact", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["paper-planar", "paper-planar-exact"])
 def test_exact_samples_are_trusted(name: str) -> None:
     system = exactly_known(load_system(name))
     estimator = session_of(system, sampled_blocks(simulate(system, DURATION)))

@@ -49,8 +49,8 @@ def steady() -> Estimator:
     return estimator
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_payload_is_an_event_beside_friction(seed: int) -> None:
     picked_up = 14.0
     capture = carrying(24.0, seed, MASS, picked_up)

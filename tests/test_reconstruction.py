@@ -120,7 +120,7 @@ def test_friction_is_found_on_a_link_seen_as_points(bench: System, rubbing: list
     assert found.system.sensors == bench.sensors
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_law_with_internal_states_is_found_by_reconstructed_coordinates(bench: System) -> None:
     """No smoother follows it, so parameters are of these coordinates, and the verdict says so."""
     law = Effect(name="presliding_friction", where="joint_1", coefficients={"torque": 3.0, "width": 0.004})

@@ -124,7 +124,7 @@ def test_what_cannot_fix_the_scale_changes_no_estimate(arm: System) -> None:
         assert abs(of_one.value - of_other.value) < 0.01 * of_other.std
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_gains_that_a_session_finds_hold_on_another_run(arm: System) -> None:
     """True parameters, without the gain and with it, on a run without noise; a result hands its own on."""
     run = sms.simulate(arm, effects=[f"torque_gain@joint_2:ratio={GAIN}"])

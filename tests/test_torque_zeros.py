@@ -37,7 +37,7 @@ def shifted(capture: sms.Capture, share: float) -> tuple[sms.Capture, float]:
     return replace(capture, values=values), offset
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_zeros_that_differ_are_taken_off(system: sms.System, captures: list[sms.Capture]) -> None:
     second, offset = shifted(captures[1], SECOND)
     third, offset_held_out = shifted(captures[2], HELD_OUT)
