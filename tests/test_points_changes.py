@@ -199,7 +199,7 @@ def test_a_drift_that_nobody_follows_is_said() -> None:
     result = sms.estimate(BENCH, data)
     assert {event.parameters for event in result.events} == {("joint_1.damping",)}
     assert "joint_1.damping has jumped the same way" in result.trust.sentence
-    assert "kalman:drift=random_walk" in result.trust.next_step
+    assert "kalman:drift=random_walk,share=0.001" in result.trust.next_step
     assert not result.trust.grave
 
 

@@ -49,7 +49,7 @@ MEASURE_SLOPES = "measure slopes of the links too: the momentum balance then inc
 STATE_HOLD = "state hold = true under [[sensor]] of the torques"
 WEIGH = "check torque constants and gear ratios, or weigh one part and state it under [known]"
 FOLLOW = "replay it with `--tracker kalman:drift=learned` (tracker = kalman, drift = learned)"
-WALK = "replay it with `--tracker kalman:drift=random_walk` (tracker = kalman, drift = random_walk)"
+WALK = "replay it with `--tracker kalman:drift=random_walk,share=0.001`"
 LONGER = "record for longer: so few windows do not show whether it is noise of the torques or a force; else "
 OR_DRIFTS = f"{FOLLOW}, if a parameter may have drifted; else "
 GO_ON = "record for longer: a drift is followed once it is certain; then run `sms-online diagnose`"
