@@ -41,9 +41,7 @@ def started(tmp_path: Path) -> Iterator[list[subprocess.Popen[Any]]]:
 
 def tier(verb: str, mode: str) -> tuple[pytest.MarkDecorator, ...]:
     """Of a verb with a view: served pages, whose ports are the usual ones, are for themselves."""
-    if mode == "serve" and verb != "live":
-        return (pytest.mark.realtime,)
-    return () if (verb, mode) == ("demo", "save") else (pytest.mark.long,)
+    return (pytest.mark.realtime,) if mode == "serve" and verb != "live" else (pytest.mark.long,)
 
 
 MODES = [

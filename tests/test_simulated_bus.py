@@ -173,6 +173,7 @@ def test_a_stopped_live_session_replays_to_the_same_results(
     assert document(tmp_path / "run")["samples"] > 1000
 
 
+@pytest.mark.long
 @pytest.mark.realtime
 def test_after_a_kill_a_new_session_resumes(arm: tuple[SimulatedArm, Path], tmp_path: Path) -> None:
     moving, file = arm
