@@ -94,6 +94,13 @@ def true_values(system: System) -> dict[str, float]:
     return {p.name: p.nominal for p in build_model(system).parameters}
 
 
+def check_parameters(estimator: Estimator, system: System) -> None:
+    """That all parameters are those of a system, within four standard deviations."""
+    now, truth = estimator.estimate(), true_values(system)
+    expected = estimator.base.values(np.array([truth.get(p.name, 0.0) for p in estimator.model.parameters]))
+    assert np.all(np.abs(now.pi - expected) < 4.0 * now.std)
+
+
 def check_named(case: str, described: System, block: Block) -> None:
     """That the only event of a session is the change of a case, with its size, and the parameters behind it hold."""
     before, after, kind, name = CHANGES[case]
@@ -105,10 +112,7 @@ def check_named(case: str, described: System, block: Block) -> None:
     jump = true_values(after).get(name, 0.0) - true_values(before).get(name, 0.0)
     size, std = event.sizes[event.parameters.index(name)], event.stds[event.parameters.index(name)]
     assert abs(size - jump) < 4.0 * std < 0.1 * abs(jump)
-    now, base = estimator.estimate(), estimator.base
-    truth = true_values(after)
-    expected = base.values(np.array([truth.get(p.name, 0.0) for p in estimator.model.parameters]))
-    assert np.all(np.abs(now.pi - expected) < 4.0 * now.std)
+    check_parameters(estimator, after)
 
 
 @pytest.mark.parametrize(
@@ -134,9 +138,7 @@ def test_what_is_grasped_and_released_leaves_what_was_before() -> None:
     for event, mass in zip(estimator.events, (3.0, -3.0), strict=True):
         mass_at = event.parameters.index("payload.mass")
         assert abs(event.sizes[mass_at] - mass) < 4.0 * event.stds[mass_at] < 0.01
-    now, truth = estimator.estimate(), true_values(PLANAR)
-    expected = estimator.base.values(np.array([truth.get(p.name, 0.0) for p in estimator.model.parameters]))
-    assert np.all(np.abs(now.pi - expected) < 4.0 * now.std)
+    check_parameters(estimator, PLANAR)
 
 
 @pytest.mark.long
