@@ -20,7 +20,7 @@ from sms_online.effects.build import build_model
 from sms_online.errors import InputError
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
-from sms_online.priors import GivenPrior, base_prior, given_prior, with_estimates
+from sms_online.priors import GivenPrior, given_prior, known_beforehand, with_estimates
 from sms_online.recorded import Recorded
 from sms_online.result import Finding, Parameter, Parameters
 from sms_online.row_types import Residual, Residuals
@@ -157,7 +157,7 @@ def diagnose(
     beforehand = given_prior(prior)
 
     def known(estimator: Estimator) -> Prior | None:
-        return base_prior(system, estimator.base, beforehand) if beforehand or system.priors else None
+        return known_beforehand(system, estimator.base, beforehand)
 
     name = ", ".join(each.name for each in (recorded, *others))
     found, said = diagnose_recorded(system, [blocks, *further], held, name, known, progress, stop, learned)

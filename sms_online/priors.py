@@ -47,6 +47,11 @@ def given_prior(prior: GivenPrior) -> bool | dict[str, Any]:
     return {"system": document["system"], "parameters": parameters, "covariance": document["covariance"]}
 
 
+def known_beforehand(system: System, base: BaseParameters, prior: bool | Mapping[str, Any]) -> Prior | None:
+    """Prior of the base parameters, None where nothing is known; see `base_prior`."""
+    return base_prior(system, base, prior) if prior or system.priors else None
+
+
 def base_prior(system: System, base: BaseParameters, prior: bool | Mapping[str, Any]) -> Prior:
     """Prior of the base parameters β = π_independent + mixture π_dependent, NaN where nothing is known.
 

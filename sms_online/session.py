@@ -16,13 +16,13 @@ from sms_online.data import Data, recorded_session
 from sms_online.description.channels import channels as known_channels
 from sms_online.description.given import Given, given_system
 from sms_online.description.schema import System, TrackerChoice
-from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.searcher import Searcher
+from sms_online.diagnosis.smoothed import running_diagnosis
 from sms_online.errors import InputError
 from sms_online.history import HistoryRecorder
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.snapshot import statistics_of
-from sms_online.priors import GivenPrior, base_prior, given_prior
+from sms_online.priors import GivenPrior, given_prior, known_beforehand
 from sms_online.recorded import Recorded
 from sms_online.result import Result, result_of
 from sms_online.state import Stage
@@ -80,9 +80,10 @@ class Session:
         check_channels(self.channels, known_channels(system), source)
         self.estimator = Estimator(system, self.channels, source)
         known = given_prior(prior)
-        if known or system.priors:
-            # A prior is on the base parameters, which the estimator has found.
-            self.estimator.set_prior(base_prior(system, self.estimator.base, known))
+        # A prior is on the base parameters, which the estimator has found.
+        beforehand = known_beforehand(system, self.estimator.base, known)
+        if beforehand is not None:
+            self.estimator.set_prior(beforehand)
         # Before the diagnosis, which may have the estimator go on with others.
         self.recorder = HistoryRecorder(self.estimator)
         self.estimator.observers.append(self.recorder)
@@ -94,7 +95,7 @@ class Session:
             from sms_online.diagnosis.online_search import Immediate
 
             searcher = Immediate()
-        self.diagnosis = OnlineDiagnosis(self.estimator, searcher, adopt)
+        self.diagnosis = running_diagnosis(self.estimator, searcher, adopt, source, known)
         self.busy = 0.0  # s of computing
         self._begun = {"channels": self.channels, "prior": known, "adopt": adopt, "source": source}
         self._source = source

@@ -82,7 +82,7 @@ def diagnosis_document(
         "calibration": [
             {**each.document(), "sentence": str(each), "next_step": each.advice} for each in diagnosis.calibration
         ],
-        "effects": [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis),
+        "effects": effects_document(diagnosis),
         "drifts": [{**drift.document(), "sentence": sentence(drift)} for drift in diagnosis.drifts],
         "steps": [
             {"taken": step.taken, "effects": list(step.effects), "holdout": step.relative} for step in diagnosis.steps
@@ -298,6 +298,11 @@ def _named_in_words(diagnosis: Search, named: Effect) -> str:
 
 def _part(part: Part) -> dict[str, Residual]:
     return {row: Residual(part.relative.get(row), whitened) for row, whitened in part.whitened.items()}
+
+
+def effects_document(diagnosis: Search) -> list[dict[str, Any]]:
+    """The effects found, as diagnosis.json holds them."""
+    return [_effect(diagnosis, finding) for finding in diagnosis.findings] + _by_comparison(diagnosis)
 
 
 def _effect(diagnosis: Search, finding: Finding) -> dict[str, Any]:

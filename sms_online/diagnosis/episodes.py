@@ -48,7 +48,8 @@ class SearchAnswer:
 class Episode:
     """More than noise, and what came of it.
 
-    noticed: s, samples up to then were there. row: type of the rows that leave most; began: s, None where it may have
+    noticed: s, samples up to then were there. row: type of the rows that leave most, "" where the smoother has noticed
+    it, which has no rows of such types; began: s, None where it may have
     been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing
     of it, "change" where a jump of parameters, the event, explains it, or "drift" where parameters drift, and the
     judged tracker follows them. named_at: s, when a search first named what was found in the end, when the event was
@@ -71,7 +72,10 @@ class Episode:
 
 def line(episode: Episode) -> str:
     """What there is to say of an episode."""
-    where = f"the residual of {episode.row} exceeds its predicted noise since {episode.noticed:.2f} s"
+    what = f"the residual of {episode.row} exceeds its predicted noise"
+    where = (
+        f"{what if episode.row else 'samples do not agree with the equations of motion'} since {episode.noticed:.2f} s"
+    )
     if episode.verdict == "named":
         effects = ", ".join(_described(named) for named in episode.named)
         taken = ""
@@ -110,7 +114,8 @@ def discrepancy(episode: Episode) -> Discrepancy:
     named = tuple(each.key for each in episode.named)
     if episode.verdict in ("noticed", "unexplained"):
         named = nearest.keys if (nearest := _nearest(episode)) is not None else ()
-    return Discrepancy(episode.row, episode.noticed, episode.verdict, named, episode.adopted is not None)
+    adopted, refused = episode.adopted is not None, episode.refused is not None
+    return Discrepancy(episode.row, episode.noticed, episode.verdict, named, adopted, refused)
 
 
 def _described(named: Named) -> str:
@@ -127,7 +132,7 @@ def episode_document(episode: Episode) -> dict[str, Any]:
     return {
         "summary": line(episode),
         "noticed": episode.noticed,
-        "row": episode.row,
+        "row": episode.row or None,
         "began": episode.began,
         "verdict": episode.verdict,
         "named": episode.named_at,

@@ -8,28 +8,22 @@ later block, which has to be the same one in the repetition (`Searcher`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import numpy as np
 
-from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.episodes import Episode, Onset, SearchAnswer, discrepancy, episode_document, line
+from sms_online.description.schema import Effect
+from sms_online.diagnosis.episodes import Episode, Onset, SearchAnswer, line
 from sms_online.diagnosis.followed import least_samples
 from sms_online.diagnosis.record import Segment, joined
+from sms_online.diagnosis.running import RunningDiagnosis
 from sms_online.diagnosis.searcher import Outcome, Request, Searcher
-from sms_online.effects.build import with_effects
-from sms_online.grouping import grouped
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import ModelUpdate
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_balance import MARGIN
-from sms_online.pipeline.observer import Observer
 from sms_online.pipeline.synchronise import GridSamples
 from sms_online.stream import Mask
-from sms_online.verdict.evidence import Discrepancy
 
 # Times are in units of the windows of the momentum balance, those of 0.4 s at least.
 SHORTEST_UNIT = 0.4
@@ -41,18 +35,15 @@ LEAST_BEFORE = 5.0
 MOST_ADOPTED = 8
 
 
-class OnlineDiagnosis(Observer):
-    """Watches one session, from before its first sample.
+class OnlineDiagnosis(RunningDiagnosis):
+    """Watches the rows of a session's momentum balance.
 
-    searcher: may be replaced until then. adopt: add what is named to the model. on_verdict (t, text), on_evidence (t,
-    gain by candidate): receive what is new.
+    adopt: add what is named to the model.
     """
 
     def __init__(self, estimator: Estimator, searcher: Searcher, adopt: bool) -> None:
-        self.episodes: list[Episode] = []
-        self.on_verdict: Callable[[float, str], None] = lambda t, text: None
-        self.on_evidence: Callable[[float, Mapping[str, float]], None] = lambda t, scores: None
-        self._estimator, self.searcher, self._adopt = estimator, searcher, adopt
+        super().__init__(estimator, searcher)
+        self._adopt = adopt
         system = estimator.system
         self._unit = round(max(SHORTEST_UNIT, system.windows.momentum) * system.sample_rate)
         self._record: list[GridSamples] = []
@@ -68,35 +59,15 @@ class OnlineDiagnosis(Observer):
         self._due = 0  # searches of the open episode that were due so far
         self._begun = 0  # searches that were begun or left out
         self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
-        estimator.observers.append(self)
 
     @property
-    def system(self) -> System:
-        """The described system with the effects that were named, adopted or not, and those that events have added."""
-        system, momentum = self._estimator.system, self._estimator.momentum
-        found = [named.effect for episode in self.episodes for named in episode.named]
-        # A session that was resumed knows of more than its own episodes.
-        if momentum is not None:
-            found += momentum.changes.adopted
-            added = (name.rsplit(".", 1)[0].partition("@") for name in momentum.changes.added if "@" in name)
-            found += [Effect(name=name, where=where) for name, _, where in added]
-        held = {effect.key for effect in system.effects}
-        fresh = grouped((effect.key, effect) for effect in found if effect.key not in held)
-        return with_effects(system, [first for first, *_ in fresh.values()])
-
-    @property
-    def notices(self) -> list[str]:
-        """A line for each episode."""
-        return [line(episode) for episode in self.episodes]
-
-    @property
-    def discrepancies(self) -> tuple[Discrepancy, ...]:
-        """The episodes as the judgement of the session takes them."""
-        return tuple(discrepancy(episode) for episode in self.episodes)
-
-    def document(self) -> list[dict[str, Any]]:
-        """The episodes as results.json holds them."""
-        return [episode_document(episode) for episode in self.episodes]
+    def adopted(self) -> list[Effect]:
+        """See `RunningDiagnosis`; a session that was resumed knows of more than its own episodes."""
+        momentum = self._estimator.momentum
+        if momentum is None:
+            return []
+        added = (name.rsplit(".", 1)[0].partition("@") for name in momentum.changes.added if "@" in name)
+        return [*momentum.changes.adopted, *(Effect(name=name, where=where) for name, _, where in added)]
 
     def finish(self) -> None:
         """After the session's end, which may have decided on a change."""
@@ -278,25 +249,14 @@ class OnlineDiagnosis(Observer):
                 out.append(Segment(each.index[inside], each.values[inside]))
         return out
 
-    def _take_answer(self, evidence: SearchAnswer) -> None:
+    def _take_answer(self, answer: SearchAnswer) -> None:
         """Take the answer of a search."""
-        episode, outcome = self.episodes[-1], evidence.outcome
-        before = episode.evidence[-1].outcome if episode.evidence else None
-        episode.evidence.append(evidence)
-        self.on_evidence(evidence.known, outcome.scores)
-        if outcome.ended and self._onset is not None:
+        if answer.outcome.ended and self._onset is not None:
             # So much is lacking that only all that can be remembered is worth another search.
             self._due = max(self._due, len(self._onset.due) - 1)
-        if outcome.verdict != "named":
-            self._agreed = False
-            episode.verdict, episode.named, episode.named_at = "noticed", (), None
-            return
-        again = before is not None and before.verdict == "named" and before.keys == outcome.keys
-        if not again:
-            episode.named_at = evidence.known
-        episode.verdict, episode.named, self._agreed = "named", outcome.named, again
-        self.on_verdict(evidence.known, line(episode))
-        self._conclude()
+        self._agreed = self._answered(self.episodes[-1], answer)
+        if self.episodes[-1].verdict == "named":
+            self._conclude()
 
     def _conclude(self) -> None:
         """Take what two searches agree on.

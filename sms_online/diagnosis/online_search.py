@@ -31,7 +31,7 @@ from sms_online.diagnosis.record import bounded, excerpts
 from sms_online.diagnosis.reported import of_constant, of_unknowns
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.searcher import Named, Outcome, Request
+from sms_online.diagnosis.searcher import Named, Outcome, RecordedRequest, Request
 from sms_online.diagnosis.weak_windows import WeakWindows
 from sms_online.effects.build import build_model, declaring, with_effects
 from sms_online.effects.catalogue import ENTRIES, declarable
@@ -57,7 +57,7 @@ class Immediate:
     def __init__(self) -> None:
         self._done: tuple[int, Outcome | None] | None = None
 
-    def submit(self, number: int, request: Request) -> bool:
+    def submit(self, number: int, request: Request | RecordedRequest) -> bool:
         """See `Searcher`."""
         self._done = number, search(request)
         return True
@@ -105,8 +105,13 @@ class _Bounded(Hypothesis):
 
 
 @one_blas_thread()
-def search(request: Request) -> Outcome | None:
+def search(request: Request | RecordedRequest) -> Outcome | None:
     """Trace what the record holds beyond the model; None where it is too short, or its rows are degenerate."""
+    if isinstance(request, RecordedRequest):
+        # Sessions without the smoother need none of it.
+        from sms_online.diagnosis.recorded_search import search_recorded
+
+        return search_recorded(request)
     try:
         return _search(_bounded(request))
     except np.linalg.LinAlgError:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
-from sms_online.description.schema import Effect
+from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.record import Segment
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
-from sms_online.stream import Array
+from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Prior
 
 
@@ -33,6 +33,19 @@ class Request:
     beta: Array
     whitened: bool
     prior: Prior | None
+
+
+@dataclass(frozen=True)
+class RecordedRequest:
+    """Samples as they came, of a session whose parameters come from the smoother: they are diagnosed as a capture is.
+
+    source: names them. prior: what is known beforehand, see `priors.given_prior`.
+    """
+
+    system: System
+    blocks: tuple[Block, ...]
+    source: str
+    prior: bool | dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -97,7 +110,7 @@ class Outcome:
 class Searcher(Protocol):
     """Makes searches, one at a time."""
 
-    def submit(self, number: int, request: Request) -> bool:
+    def submit(self, number: int, request: Request | RecordedRequest) -> bool:
         """Begin a search; False where this one is left out."""
 
     def outcome(self, block: int) -> tuple[int, Outcome | None] | None:

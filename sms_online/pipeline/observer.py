@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from sms_online.pipeline.synchronise import GridSamples
-from sms_online.stream import Array, Indices
+from sms_online.stream import Array, Block, Indices
 
 
 class Observer:
     """Watches one session: put it into `Estimator.observers`. What it does not override it does not see."""
+
+    def received(self, block: Block) -> None:
+        """Samples of the channels that the session uses, at their own times, without outliers."""
 
     def samples(self, piece: GridSamples) -> None:
         """Grid samples of the channels that the model reads, as the synchroniser gives them."""

@@ -125,13 +125,18 @@ class SpanSmoother(SmoothedReadings):
 
     def _first(self, span: Span, beta: Array, known: Array, exactly: bool) -> SpanFit:
         """From the start that leads to equations that hold, or else to those that hold best."""
-        inexact = list[Search]()
+        inexact, refuted = list[Search](), False
         for interval in (DERIVATIVES_INTERVAL, EVERY_NODE):
             for search in self._begun(span, beta, known, interval):
                 with suppress(*NO_NUMBERS):
                     if (fit := search.exact(LEVELS[1:], STEPS)) is not None:
                         return fit
-                    inexact.append(search)
+                    if any(map(search.leaves_as_much, inexact)):
+                        refuted = True
+                    else:
+                        inexact.append(search)
+            if refuted:
+                break  # two starts have met one minimum, and it leaves more than noise
         if exactly:
             raise DivergedError("samples do not agree with the equations of motion")
         fits, why = list[SpanFit](), "neither the balance's fit nor the description leads to the samples"
@@ -147,8 +152,8 @@ class SpanSmoother(SmoothedReadings):
                 # they hold.
                 with suppress(*NO_NUMBERS):
                     fits.append(Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS))
-            if fits[-1].inexact <= NEARLY_EXACT:
-                return fits[-1]
+            if fits[-1].inexact <= NEARLY_EXACT or any(map(fits[-1].allows_as_much, fits[:-1])):
+                break
         if not fits:
             raise DivergedError(why)
         return min(fits, key=lambda each: each.inexact)

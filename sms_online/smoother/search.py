@@ -24,8 +24,11 @@ from sms_online.trackers.factor import Solution, solve, triangular_factor
 # Those that are allowed for where the samples refute exact equations; more than that is another system.
 ALLOWED = (0.001, 0.003, 0.01, 0.03)
 # Before them, times the noise that samples of the torques show: coloured noise, ripple, and friction that follows no
-# law act beside the torques, and leave the equations of all other coordinates exact.
-TORQUE_NOISE = (3.0, 10.0, 30.0, 100.0)
+# law act beside the torques, and leave the equations of all other coordinates exact. So many times at most, and each
+# time by so much more at least; by as much where it is not known how much is lacking. Far too much of it would leave
+# the scale of all parameters to the noise of the positions, so a little more than noise may be left.
+MOST_TORQUE_NOISE, LEAST_RISE, UNKNOWN_RISE = 100.0, 1.5, 3.0
+LITTLE_MORE = 1.5
 # A level is tried again while the innovations are larger than noise makes them, so often at most.
 MOST_TRIES = 3
 # Time within which forces of a level change, s: white forces of share r have the density (r F)² times this. None is to
@@ -41,12 +44,17 @@ FREE_POSITION = 10.0
 # standard deviations: the error of the last one is a sixteenth of that change, as its order is four.
 ROUGH_STEP = 0.01
 REFINED = 1.0
+# Share by which mean squares of one minimum differ at most.
+SAME = 0.01
 # Share of the mean square that steps of half the length leave, at most, where it is those that are too long.
 OF_STEPS = 0.5
 # A step of the search that moves no parameter by more standard deviations than this ends it: the next one would be
 # smaller by far, as the convergence is quadratic near the end.
 CONVERGED = 0.5
 MAX_STEPS = 16
+# So does a mean square beyond LARGEST_MISFIT that changes by less than this share in so many steps: no parameters meet
+# the samples, and friction's corners keep these moving.
+STILL, STILL_STEPS = 1e-4, 3
 # Derivatives by displacements are computed that often as a rule, s; or at every node, where the motion is fast or
 # begins far from the samples.
 DERIVATIVES_INTERVAL, EVERY_NODE = 0.04, 0.0
@@ -102,6 +110,10 @@ class SpanFit:
     def inexact(self) -> tuple[float, float]:
         """How far from exact the equations are, to compare fits by."""
         return self.level, self.torque_noise
+
+    def allows_as_much(self, other: SpanFit) -> bool:
+        """Whether it allows for as much as another fit: they have met one minimum."""
+        return self.level == other.level and abs(self.torque_noise - other.torque_noise) < SAME * other.torque_noise
 
 
 class Search:
@@ -202,12 +214,16 @@ class Search:
     def allowing(self) -> SpanFit:
         """The fit that allows for as much as samples need that do not agree with exact equations."""
         least, near = self._torque_noise, None
-        for self._torque_noise in (times for times in TORQUE_NOISE if times > least):
-            if not np.isfinite(self.mean_square):
+        while self._torque_noise < MOST_TORQUE_NOISE:
+            rise = UNKNOWN_RISE
+            if np.isfinite(self.mean_square):
+                rise = max(LEAST_RISE, float(np.sqrt(self.mean_square)))
+            else:
                 self.beta, self.motion = self._rough
+            self._torque_noise = min(MOST_TORQUE_NOISE, rise * self._torque_noise)
             if self.converge(0.0) and self.mean_square <= LARGEST_MISFIT:
                 near = self._taken(0.0)
-                if self.mean_square <= LARGEST_MEAN_SQUARE:
+                if self.mean_square <= LITTLE_MORE:
                     break
         if near is not None:
             return near
@@ -226,6 +242,12 @@ class Search:
             factor, self.beta, self.rows, self.mean_square, level, self._torque_noise, self._size, self.ending
         )
 
+    def leaves_as_much(self, other: Search) -> bool:
+        """Whether it has led to the same mean square as another search: they have met one minimum."""
+        return (
+            bool(np.isfinite(self.mean_square)) and abs(self.mean_square - other.mean_square) < SAME * other.mean_square
+        )
+
     def loosen(self, level: float) -> None:
         """Follow the samples with white forces of a level."""
         self._held = True
@@ -235,16 +257,21 @@ class Search:
                 return
 
     def converge(self, level: float, wanted: slice = slice(None), tame: bool = False, strictly: bool = False) -> bool:
-        """Search until β, or what is wanted of it, converges or steps scatter within its errors; whether it does.
+        """Search until β, or what is wanted, converges, scatters within its errors or is refuted; whether it does.
 
         strictly: it is to converge.
         """
         self._held = False
         targets: list[Array] = []
+        still = 0
         with suppress(*NO_NUMBERS):
             for _ in range(MAX_STEPS):
-                before = self.beta
+                before, left = self.beta, self.mean_square
                 self.advance(level, tame)
+                same = self.mean_square > LARGEST_MISFIT and abs(self.mean_square - left) < STILL * left
+                still = still + 1 if same else 0
+                if still == STILL_STEPS:
+                    return True
                 step = np.abs(self._asked[wanted])
                 if np.all(step <= CONVERGED * self.std[wanted]):
                     return True

@@ -6,11 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sms_online.row_types import NOISE_WHITENED
 from sms_online.smoother.jackknife import SpanBlock, jackknife_covariance, with_span
 from sms_online.smoother.search import LARGEST_MEAN_SQUARE, SpanFit
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve, triangular_factor
 from sms_online.trackers.interface import Estimate, Prior, prior_factor
+
+# Unexplained forces beside torques, times their noise, beyond which parameters are off by more than error bars say.
+LARGEST_TORQUE_NOISE = 3.0
 
 
 class SmootherStatistics(NamedTuple):
@@ -73,6 +77,13 @@ class SmootherStatistics(NamedTuple):
     def exact(self) -> bool:
         """Whether samples agree with the equations of motion, and nothing had to be allowed for."""
         return self.beyond == 1.0 and self.torque_noise == 1.0 and self.level == 0.0
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether samples contradict the equations of motion: parameters are off by more than error bars say."""
+        if self.level > 0.0 or self.torque_noise > 1.0:
+            return self.level > 0.0 or self.torque_noise > LARGEST_TORQUE_NOISE
+        return self.beyond > NOISE_WHITENED
 
     @property
     def beyond(self) -> float:

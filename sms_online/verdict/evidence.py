@@ -16,8 +16,9 @@ from sms_online.verdict.trust import Reason
 class Discrepancy:
     """Rows of a running session that leave more than noise, as diagnosed so far: see `diagnosis.episodes.Episode`.
 
-    row: type of the rows that leave most. noticed: s. effects: what was named, `name@where`, or what is nearest where
-    nothing is. adopted: whether the model has been updated with them.
+    row: type of the rows that leave most, "" where the smoother has none. noticed: s. effects: what was named,
+    `name@where`, or what is nearest where nothing is. adopted: whether the model has been updated with them; refused:
+    whether it cannot be.
     """
 
     row: str
@@ -25,6 +26,7 @@ class Discrepancy:
     verdict: str
     effects: tuple[str, ...] = ()
     adopted: bool = False
+    refused: bool = False
 
     @property
     def unexplained(self) -> bool:

@@ -15,7 +15,6 @@ from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.sensing import is_slow
 from sms_online.pipeline.statistics import Statistics
 from sms_online.pipeline.synchronise import SIDE
-from sms_online.row_types import NOISE_WHITENED
 from sms_online.verdict.contradictions import ambiguous_effects, disputes, miscalibrated
 from sms_online.verdict.evidence import Discrepancy, Evidence
 from sms_online.verdict.reasons import DIAGNOSE, MEASURE_SLOPES, STATE_HELD, unexplained_torques
@@ -27,8 +26,6 @@ if TYPE_CHECKING:
 
 # Rows of the energy balance, for each parameter, from which on its first transient is forgotten.
 ROWS_A_PARAMETER = 10
-# Unexplained forces beside torques, times their noise, beyond which parameters are off by more than error bars say.
-LARGEST_TORQUE_NOISE = 3.0
 # Changes in a row of the same parameters that are a series.
 SERIES = 3
 # Tolerances that are none of the smoother's readings.
@@ -168,8 +165,8 @@ def _inexact(smoother: SmootherStatistics) -> list[Reason]:
         return [Reason("samples do not agree with the equations of motion", True, then=STATE_HELD)]
     if smoother.torque_noise > 1.0:
         text = f"what acts beside the torques is {smoother.torque_noise:.0f} × their noise"
-        return [Reason(text, smoother.torque_noise > LARGEST_TORQUE_NOISE, then=STATE_HELD)]
+        return [Reason(text, smoother.contradicted, then=STATE_HELD)]
     if smoother.beyond == 1.0:
         return []
     text = f"innovations are {smoother.beyond:.2g} × their noise: forces on the joints do not quite follow their laws"
-    return [Reason(text, smoother.beyond > NOISE_WHITENED, then=STATE_HELD)]
+    return [Reason(text, smoother.contradicted, then=STATE_HELD)]

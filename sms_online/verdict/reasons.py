@@ -31,7 +31,8 @@ VITAL = ("mass", "mass_per_length", *ELASTIC)
 UNDECIDED = "ambiguous place"
 # What to do next.
 DIAGNOSE = "run `sms-online diagnose` on the recording"
-ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it writes, or use --adopt"
+ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it writes"
+OR_ADOPT = f"{ADD_EFFECT}, or use --adopt"
 THEN_DIAGNOSE = ", then run `sms-online diagnose`"
 IF_NOTHING = f"{DIAGNOSE}; where it finds nothing, and "
 GO_ON_WITH = "go on with the system.toml that was written, and check it on another run: `sms-online validate`"
@@ -86,7 +87,8 @@ def lacking(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
         if each.verdict == "named" and not each.adopted:
             places = tuple(place(effect) for effect in each.effects)
             mark = ", ".join(dict.fromkeys(kind(effect) for effect in each.effects))
-            out.append(Reason(f"the model lacks {listed(each.effects)}", True, places, mark, then=ADD_EFFECT))
+            then = ADD_EFFECT if each.refused else OR_ADOPT
+            out.append(Reason(f"the model lacks {listed(each.effects)}", True, places, mark, then=then))
     return out
 
 
