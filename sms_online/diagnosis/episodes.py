@@ -49,12 +49,11 @@ class Episode:
     """More than noise, and what came of it.
 
     noticed: s, samples up to then were there. row: type of the rows that leave most, "" where the smoother has noticed
-    it, which has no rows of such types; began: s, None where it may have
-    been there from the start. verdict: "noticed", "named", "unexplained", "passed" where the last samples show nothing
-    of it, "change" where a jump of parameters, the event, explains it, or "drift" where parameters drift, and the
-    judged tracker follows them. named_at: s, when a search first named what was found in the end, when the event was
-    decided, or when the tracker found the drift. adopted: s, when the model was updated with what was named; refused:
-    why not. drifting: names of parameters.
+    it, which has no rows of such types; began: s, None where it may have been there from the start. verdict: "noticed",
+    "named", "unexplained", "passed" where the last samples show nothing of it, "change" where a jump of parameters, the
+    event, explains it, or "drift" where parameters drift, and the judged tracker follows them. named_at: s, when a
+    search first named what was found in the end, when the event was decided, or when the tracker found the drift.
+    adopted: s, when the model was updated with what was named; refused: why not. drifting: names of parameters.
     """
 
     noticed: float
@@ -72,10 +71,10 @@ class Episode:
 
 def line(episode: Episode) -> str:
     """What there is to say of an episode."""
-    what = f"the residual of {episode.row} exceeds its predicted noise"
-    where = (
-        f"{what if episode.row else 'samples do not agree with the equations of motion'} since {episode.noticed:.2f} s"
-    )
+    what = "samples do not agree with the equations of motion"
+    if episode.row:
+        what = f"the residual of {episode.row} exceeds its predicted noise"
+    where = f"{what} since {episode.noticed:.2f} s"
     if episode.verdict == "named":
         effects = ", ".join(_described(named) for named in episode.named)
         taken = ""

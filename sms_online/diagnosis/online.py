@@ -48,7 +48,6 @@ class OnlineDiagnosis(RunningDiagnosis):
         self._unit = round(max(SHORTEST_UNIT, system.windows.momentum) * system.sample_rate)
         self._record: list[GridSamples] = []
         self._valid = 0  # grid index from which on the current model, or what it lacks, has been there
-        self._blocks = 0
         self._events = len(estimator.events)
         self._drifts = 0 if estimator.momentum is None else estimator.momentum.bank.accepted  # that have been followed
         self._quiet = False  # what is lacking has been said, and not added to the model
@@ -57,8 +56,6 @@ class OnlineDiagnosis(RunningDiagnosis):
         self._agreed = False  # two searches in a row have named the same in the open episode
         self._sure = False  # and nothing else explains it as well, as far as is known
         self._due = 0  # searches of the open episode that were due so far
-        self._begun = 0  # searches that were begun or left out
-        self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
 
     @property
     def adopted(self) -> list[Effect]:
@@ -85,17 +82,15 @@ class OnlineDiagnosis(RunningDiagnosis):
 
     def block_through(self) -> None:
         """See `Observer`."""
-        self._blocks += 1
-        done = self.searcher.outcome(self._blocks)
+        done = self._outcome()
         if self._estimator.momentum is None or not self._record:
             return
         self._follow_events()
         self._follow_drifts()
         self._conclude()
-        if done is not None and self._pending is not None and done[0] == self._pending[0]:
-            time, self._pending = self._pending[1], None
-            if done[1] is not None and self._onset is not None:
-                self._take_answer(SearchAnswer(time, self._now, done[1]))
+        answer = self._awaited(done)
+        if answer is not None and self._onset is not None:
+            self._take_answer(answer)
         self._withdraw()
         self._notice()
         self._search()
@@ -198,8 +193,8 @@ class OnlineDiagnosis(RunningDiagnosis):
             self._due = due
             self._begun += 1
             request = self._request(onset)
-            if request is not None and self.searcher.submit(self._begun, request):
-                self._pending = self._begun, self._now
+            if request is not None:
+                self._submit(request)
         elif self._due == len(onset.due):
             self._give_up()
 

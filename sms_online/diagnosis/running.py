@@ -7,7 +7,7 @@ from typing import Any
 
 from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.episodes import Episode, SearchAnswer, discrepancy, episode_document, line
-from sms_online.diagnosis.searcher import Searcher
+from sms_online.diagnosis.searcher import Outcome, RecordedRequest, Request, Searcher
 from sms_online.effects.build import with_effects
 from sms_online.grouping import grouped
 from sms_online.pipeline.estimator import Estimator
@@ -27,6 +27,9 @@ class RunningDiagnosis(Observer):
         self.on_evidence: Callable[[float, Mapping[str, float]], None] = lambda t, scores: None
         self.searcher = searcher
         self._estimator = estimator
+        self._blocks = 0
+        self._begun = 0  # searches that were begun or left out
+        self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
         estimator.observers.append(self)
 
     @property
@@ -59,6 +62,28 @@ class RunningDiagnosis(Observer):
 
     def finish(self) -> None:
         """After the session's end, which may have decided on a change."""
+
+    @property
+    def _now(self) -> float:
+        """Time of the newest sample, s."""
+        raise NotImplementedError
+
+    def _submit(self, request: Request | RecordedRequest) -> None:
+        """Have samples up to now searched, unless the searcher leaves that out."""
+        if self.searcher.submit(self._begun, request):
+            self._pending = self._begun, self._now
+
+    def _outcome(self) -> tuple[int, Outcome | None] | None:
+        """What the searcher has at one block more: to be asked once a block, whatever becomes of it."""
+        self._blocks += 1
+        return self.searcher.outcome(self._blocks)
+
+    def _awaited(self, done: tuple[int, Outcome | None] | None) -> SearchAnswer | None:
+        """The answer of the search that is waited for; None where that is not done, or has ended without one."""
+        if done is None or self._pending is None or done[0] != self._pending[0]:
+            return None
+        time, self._pending = self._pending[1], None
+        return None if done[1] is None else SearchAnswer(time, self._now, done[1])
 
     def _answered(self, episode: Episode, answer: SearchAnswer) -> bool:
         """Add the answer of a search to an episode; whether it names what the one before it has named."""

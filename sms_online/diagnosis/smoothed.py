@@ -36,8 +36,6 @@ class SmoothedDiagnosis(RunningDiagnosis):
         super().__init__(estimator, searcher)
         self._source, self._prior = source, prior
         self._record: list[Block] = []
-        self._blocks = 0
-        self._begun = 0  # searches of the session
         self._events = len(estimator.events)
         self._begin(-np.inf)
 
@@ -47,7 +45,7 @@ class SmoothedDiagnosis(RunningDiagnosis):
         self._episode: Episode | None = None
         self._asked = 0  # searches of the episode
         self._next = -np.inf  # time of the samples from which on another one is due, s
-        self._pending: tuple[int, float] | None = None  # number of a search that runs, and time of its last sample, s
+        self._pending = None
 
     def received(self, block: Block) -> None:
         """See `Observer`."""
@@ -58,16 +56,14 @@ class SmoothedDiagnosis(RunningDiagnosis):
 
     def block_through(self) -> None:
         """See `Observer`."""
-        self._blocks += 1
-        done = self.searcher.outcome(self._blocks)
+        done = self._outcome()
         events = self._estimator.events[self._events :]
         if events:
             self._events += len(events)
             self._begin(events[-1].time + BEHIND_A_CHANGE)
-        if done is not None and self._pending is not None and done[0] == self._pending[0]:
-            time, self._pending = self._pending[1], None
-            if done[1] is not None:
-                self._take_answer(SearchAnswer(time, self._now, done[1]))
+        answer = self._awaited(done)
+        if answer is not None:
+            self._take_answer(answer)
         self._search()
 
     @property
@@ -91,10 +87,7 @@ class SmoothedDiagnosis(RunningDiagnosis):
         self._begun += 1
         inside = [Block(b.t[b.t >= first], b.channels, b.values[b.t >= first]) for b in self._record]
         samples = tuple(block for block in inside if block.t.size)
-        if self.searcher.submit(
-            self._begun, RecordedRequest(self._estimator.system, samples, self._source, self._prior)
-        ):
-            self._pending = self._begun, self._now
+        self._submit(RecordedRequest(self._estimator.system, samples, self._source, self._prior))
 
     def _take_answer(self, answer: SearchAnswer) -> None:
         episode = self._episode

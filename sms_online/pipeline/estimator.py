@@ -310,8 +310,9 @@ class Estimator(Stage):
 
     def _synchronise(self, t: Array, values: Array, last: bool = False) -> None:
         t, values = self._outliers.push(t, self._identity.push(t, values), last)
+        received = Block(t, self.channels, values)
         for observer in self.observers:
-            observer.received(Block(t, self.channels, values))
+            observer.received(received)
         own = len(self.sensing.channels)
         block = self._attitude.continued(Block(t, self.sensing.channels, values[:, :own]))
         if self.smoother is not None:
