@@ -16,7 +16,8 @@ from sms_online.effects.catalogue import parse_effect
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.events import Event
 from sms_online.smoother.changes import ALARM, contradicts
-from sms_online.smoother.search import DivergedError, SpanFit
+from sms_online.smoother.gauss_newton import DivergedError
+from sms_online.smoother.search import SpanFit
 from sms_online.smoother.span import Ending
 from sms_online.stream import Block
 from sms_online.verdict.gather import repeated

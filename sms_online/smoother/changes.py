@@ -30,8 +30,9 @@ from sms_online.pipeline.event_hypotheses import (
 from sms_online.pipeline.sensing import Sensing
 from sms_online.smoother.fit import diverging
 from sms_online.smoother.gatherer import Gatherer
+from sms_online.smoother.gauss_newton import EVERY_NODE, DivergedError
 from sms_online.smoother.problem import SpanProblem
-from sms_online.smoother.search import EVERY_NODE, LARGEST_MEAN_SQUARE, DivergedError, Search, SpanFit
+from sms_online.smoother.search import LARGEST_MEAN_SQUARE, Search, SpanFit
 from sms_online.stream import Array
 from sms_online.trackers import factor as factors
 

@@ -16,16 +16,9 @@ from contextlib import contextmanager, suppress
 import numpy as np
 
 from sms_online.pipeline.description import LOOSE, described, near_rows
+from sms_online.smoother.gauss_newton import DERIVATIVES_INTERVAL, EVERY_NODE, NO_NUMBERS, DivergedError
 from sms_online.smoother.readings import SmoothedReadings
-from sms_online.smoother.search import (
-    DERIVATIVES_INTERVAL,
-    EVERY_NODE,
-    LARGEST_MEAN_SQUARE,
-    NO_NUMBERS,
-    DivergedError,
-    Search,
-    SpanFit,
-)
+from sms_online.smoother.search import LARGEST_MEAN_SQUARE, Search, SpanFit
 from sms_online.smoother.span import Ending, Span
 from sms_online.stream import Array
 

@@ -13,8 +13,8 @@ from sms_online.pipeline.sensing import Sensing
 from sms_online.smoother.first_motion import FirstMotion
 from sms_online.smoother.fit import SpanSmoother
 from sms_online.smoother.gatherer import Gatherer
+from sms_online.smoother.gauss_newton import DivergedError
 from sms_online.smoother.nuisances import ReadingNuisances
-from sms_online.smoother.search import DivergedError
 from sms_online.smoother.span import Span
 from sms_online.stream import Array
 

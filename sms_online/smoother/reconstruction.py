@@ -24,7 +24,7 @@ from sms_online.model.readings import position_channels
 from sms_online.pipeline.description import described
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensing import Sensing
-from sms_online.smoother.search import DivergedError
+from sms_online.smoother.gauss_newton import DivergedError
 from sms_online.smoother.session import Smoother
 from sms_online.stream import Block
 from sms_online.trackers.factor import triangular_factor

@@ -21,9 +21,10 @@ from sms_online.pipeline.tracker_bank import Reading
 from sms_online.smoother.changes import SpanChanges, Step, contradicts
 from sms_online.smoother.fit import SpanSmoother
 from sms_online.smoother.gatherer import Gatherer
+from sms_online.smoother.gauss_newton import DivergedError
 from sms_online.smoother.noise import SpanNoise
 from sms_online.smoother.problem import SpanProblem
-from sms_online.smoother.search import LARGEST_MEAN_SQUARE, DivergedError, SpanFit
+from sms_online.smoother.search import LARGEST_MEAN_SQUARE, SpanFit
 from sms_online.smoother.span import Ending, Span
 from sms_online.smoother.statistics import SmootherStatistics
 from sms_online.smoother.tracking import SpanTrackers
