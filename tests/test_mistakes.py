@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
+from sms_online.description.parse import parse_system
 from sms_online.description.schema import Effect, System
 from sms_online.description.sources import LogSignal, TableSource
 from sms_online.diagnosis.diagnose import diagnose
@@ -112,6 +113,34 @@ def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: st
     assert corrected.mistakes[0].step
     block = wrong(change)
     np.testing.assert_allclose(corrected.samples(block.channels, block.values), session(4).values, rtol=1e-9)
+
+
+def test_an_encoder_before_the_gear_may_be_a_joints_only_one() -> None:
+    """Or one that its source has taken through the gear though it is behind it."""
+    text = """
+    name = "axis"
+    [joint_1]
+    axis = [0.0, 0.0, 1.0]
+    gear_ratio = 80.0
+    transmission = "rigid"
+    [motor_1]
+    rotor_inertia = 3e-5
+    [link_1]
+    kind = "rigid"
+    inertia = { xx = 0.5, yy = 0.5, zz = 0.5 }
+    [[source]]
+    kind = "table"
+    name = "log"
+    stamp = "t"
+    [source.signals]
+    "angle" = { channel = "q_1", unit = "deg" GEAR }
+    "torque" = { channel = "tau_1" }
+    """
+    for stated, factor, words in (("", 1.0 / 80.0, "before the gear"), (", gear = 80", 80.0, "gear ratio 80 twice")):
+        system = parse_system(text.replace(" GEAR", stated), "axis")
+        (gear,) = (each for each in mistake_hypotheses(system, ("q_1", "tau_1")) if each.name == "motor_angle")
+        assert words in gear.sentence
+        np.testing.assert_allclose(gear.apply(("q_1", "tau_1"), np.ones((1, 2))), [[factor, 1.0]])
 
 
 @pytest.mark.slow

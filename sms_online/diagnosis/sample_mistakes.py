@@ -159,12 +159,28 @@ def _converted_twice(system: System, positions: Sequence[str]) -> Iterator[Mista
 
 
 def _geared(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
+    """Encoders at the motor's shaft that no source takes through the gear, and those that one does though they are not.
+
+    Of a joint with one encoder that is q_i, wherever it is mounted.
+    """
+    stated = {
+        signal.channel
+        for source in system.sources
+        for signal in (source.signals.values() if isinstance(source, LogSource) else ())
+        if signal.gear != 1.0
+    }
     for i, joint in enumerate(system.joints, start=1):
-        name = f"theta_m_{i}"
-        if name in channels and joint.gear_ratio != 1.0:
-            n = joint.gear_ratio
-            said = f"{name} is the motor's angle before the gear, {n:g} × the angle after it"
-            yield MistakeHypothesis("motor_angle", name, said, f"divide {name} by {n:g}", scaled([name], 1.0 / n))
+        n = joint.gear_ratio
+        for name in (f"theta_m_{i}", f"q_{i}"):
+            if name not in channels or n == 1.0:
+                continue
+            if name in stated:
+                said = f"{name} is divided by the gear ratio {n:g} twice"
+                then = f"leave the gear out of its source, or multiply {name} by {n:g}"
+                yield MistakeHypothesis("motor_angle", name, said, then, scaled([name], n))
+            else:
+                said = f"{name} is the motor's angle before the gear, {n:g} × the angle after it"
+                yield MistakeHypothesis("motor_angle", name, said, f"divide {name} by {n:g}", scaled([name], 1.0 / n))
 
 
 def _counts(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
