@@ -152,8 +152,7 @@ class Relinearisation(Stage):
 
     def _look(self, noise: SensorNoise, last: bool) -> None:
         """Now and then, where the estimate is far from the point that rows are linear about: go there."""
-        if self.momentum.changes.events or self.momentum.changes.shifts:
-            # No one point is that of the samples before and after.
+        if self._has_changed:
             self.linearisation.forget()
         if self.momentum.lacking(last) and self.linearisation.state.samples:
             self.state.patient = False
@@ -170,7 +169,16 @@ class Relinearisation(Stage):
                 self._make_rows_again(weights, noise, last)
                 self.linearisation.forget()
                 return
+            if self._has_changed:
+                # Rows about this point show an event, and parameters that it adds are none of those before it.
+                self.linearisation.forget()
+                return
             before, weights = self.linearisation.point, self.momentum.weights
+
+    @property
+    def _has_changed(self) -> bool:
+        """Whether something has changed: no one point is that of the samples before and after."""
+        return bool(self.momentum.changes.events or self.momentum.changes.shifts)
 
     @property
     def _lacks(self) -> bool:
