@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from sms_online.description.schema import Effect
 from sms_online.diagnosis.episodes import line
 from sms_online.diagnosis.online import OnlineDiagnosis
 from sms_online.diagnosis.online_search import Immediate
-from sms_online.diagnosis.searcher import Named, Outcome, RecordedRequest, Request
+from sms_online.diagnosis.searcher import AnyRequest, Named, Outcome, RecordedRequest
 from sms_online.diagnosis.smoothed import LEAST, SmoothedDiagnosis, running_diagnosis
 from sms_online.effects.build import declaring
 from sms_online.pipeline.estimator import Estimator
@@ -21,6 +21,7 @@ from sms_online.pipeline.events import Event
 from sms_online.smoother.session import Smoother
 from sms_online.smoother.statistics import LARGEST_TORQUE_NOISE
 from sms_online.stream import Block
+from sms_online.verdict.reasons import lacking
 from sms_sim.simulate import sampled_blocks, simulate
 from tests.camera_rig import marked_bench
 
@@ -40,21 +41,32 @@ FRICTION = Named(
 )
 
 
-class Scripted:
-    """A searcher that answers at once with one outcome after the other. spans: of samples that were searched, s."""
+VISCOUS = replace(FRICTION, effect=Effect(name="viscous_friction", where="joint_1", coefficients={"damping": 1.0}))
 
-    def __init__(self, *named: Sequence[Named]) -> None:
-        self.spans: list[tuple[float, float]] = []
-        self._named = list(named)
+
+def found(*named: Named, mistakes: tuple[str, ...] = ()) -> Outcome:
+    """What a search says that has found so much."""
+    verdict = "mistake" if mistakes else "named" if named else "unexplained"
+    return Outcome(verdict, named, {}, 0.1, began=False, beta=np.empty(0), mistakes=mistakes)
+
+
+class Scripted:
+    """A searcher that answers at once with one outcome after the other. requests: what it was asked."""
+
+    def __init__(self, *outcomes: Outcome | None) -> None:
+        self.requests: list[RecordedRequest] = []
+        self._outcomes = list(outcomes)
         self._done: tuple[int, Outcome | None] | None = None
 
-    def submit(self, number: int, request: Request | RecordedRequest) -> bool:
+    @property
+    def spans(self) -> list[tuple[float, float]]:
+        """Times of the samples that were searched, s."""
+        return [(float(each.blocks[0].t[0]), float(each.blocks[-1].t[-1])) for each in self.requests]
+
+    def submit(self, number: int, request: AnyRequest) -> bool:
         assert isinstance(request, RecordedRequest)
-        t = np.concatenate([block.t for block in request.blocks])
-        self.spans.append((float(t[0]), float(t[-1])))
-        named = tuple(self._named.pop(0))
-        verdict = "named" if named else "unexplained"
-        self._done = number, Outcome(verdict, named, {}, 0.1, began=False, beta=np.empty(0))
+        self.requests.append(request)
+        self._done = number, self._outcomes.pop(0)
         return True
 
     def outcome(self, block: int) -> tuple[int, Outcome | None] | None:
@@ -84,42 +96,113 @@ def watched(searcher: Scripted) -> tuple[Estimator, SmoothedDiagnosis]:
     return estimator, SmoothedDiagnosis(estimator, searcher, "bench", prior=False)
 
 
+def keys(diagnosis: SmoothedDiagnosis) -> list[str]:
+    """What is named in the end."""
+    return [named.key for episode in diagnosis.episodes for named in episode.named]
+
+
 @pytest.mark.usefixtures("refuted")
 def test_searches_begin_with_ten_seconds_and_end_when_two_agree() -> None:
-    searcher = Scripted([FRICTION], [FRICTION])
+    searcher = Scripted(found(FRICTION), found(FRICTION))
     estimator, diagnosis = watched(searcher)
-    estimator.push(resting(0.0, 40.0))
+    estimator.push(resting(0.0, 33.0))
     (first, _), (again, end) = searcher.spans
     assert (first, again) == (0.0, 0.0)
     assert end - first > LEAST + 5.0
-    (episode,) = diagnosis.episodes
-    assert [named.key for named in episode.named] == ["coulomb_friction@joint_1"]
-    assert line(episode).startswith("samples do not agree with the equations of motion since ")
+    assert keys(diagnosis) == ["coulomb_friction@joint_1"]
+    assert line(diagnosis.episodes[0]).startswith("samples do not agree with the equations of motion since ")
     assert diagnosis.document()[0]["row"] is None
     assert [effect.key for effect in diagnosis.system.effects] == ["coulomb_friction@joint_1"]
+    assert [each.effects for each in diagnosis.discrepancies] == [("coulomb_friction@joint_1",)]
 
 
 @pytest.mark.usefixtures("refuted")
 def test_what_a_later_search_does_not_find_is_withdrawn() -> None:
-    searcher = Scripted([FRICTION], [], [])
+    searcher = Scripted(found(FRICTION), found(), found())
     estimator, diagnosis = watched(searcher)
+    said = list[str]()
+    diagnosis.on_verdict = lambda t, text: said.append(text)
     estimator.push(resting(0.0, 12.0))
-    assert len(diagnosis.episodes) == 1
-    estimator.push(resting(12.0, 60.0))
-    assert diagnosis.episodes == []
+    assert keys(diagnosis) == ["coulomb_friction@joint_1"]
+    estimator.push(resting(12.0, 33.0))
+    assert diagnosis.episodes[0].verdict == "unexplained"
+    assert diagnosis.discrepancies == ()
     assert len(searcher.spans) == 3
+    ends = ["not named yet", "N m)", "not named yet", "no known effect explains"]
+    assert all(end in text for end, text in zip(ends, said, strict=True))
+
+
+@pytest.mark.usefixtures("refuted")
+@pytest.mark.parametrize("last", [found(FRICTION), None])
+def test_three_searches_that_do_not_agree_name_nothing(last: Outcome | None) -> None:
+    searcher = Scripted(found(FRICTION), found(VISCOUS), last)
+    estimator, diagnosis = watched(searcher)
+    estimator.push(resting(0.0, 33.0))
+    assert diagnosis.episodes[0].verdict == "unexplained"
+    assert keys(diagnosis) == []
+    assert [each["verdict"] for each in diagnosis.document()] == ["unexplained"]
+
+
+@pytest.mark.usefixtures("refuted")
+def test_searches_without_an_answer_say_nothing_of_effects() -> None:
+    estimator, diagnosis = watched(Scripted(None, None, None))
+    estimator.push(resting(0.0, 33.0))
+    assert diagnosis.episodes[0].verdict == "noticed"
+
+
+@pytest.mark.usefixtures("refuted")
+def test_a_mistake_is_said_in_its_words() -> None:
+    mistake = "tau_1 looks like mN m in place of N m"
+    estimator, diagnosis = watched(Scripted(*[found(FRICTION, mistakes=(mistake,))] * 2))
+    estimator.push(resting(0.0, 33.0))
+    assert mistake in line(diagnosis.episodes[0])
+    (reason,) = lacking(diagnosis.discrepancies)
+    assert reason.text == mistake
 
 
 @pytest.mark.usefixtures("refuted")
 def test_samples_before_a_change_are_not_searched() -> None:
-    searcher = Scripted([], [FRICTION], [FRICTION])
+    searcher = Scripted(found(FRICTION), found(FRICTION))
     estimator, diagnosis = watched(searcher)
-    estimator.push(resting(0.0, 14.0))
     assert estimator.smoother is not None
     estimator.smoother.state.events = [Event(12.0, "unexplained", (), (), (), (), 2)]
-    estimator.push(resting(14.0, 40.0))
-    assert [begin for begin, _ in searcher.spans[1:]] == pytest.approx([13.0, 13.0], abs=1.0 / RATE)
-    assert diagnosis.episodes[0].began == pytest.approx(13.0)
+    estimator.push(resting(0.0, 29.0))
+    assert [begin for begin, _ in searcher.spans] == pytest.approx([13.0, 13.0], abs=1.0 / RATE)
+    assert diagnosis.episodes[0].began == 12.0
+    assert [event.time for event in searcher.requests[0].events] == [12.0]
+
+
+@pytest.mark.usefixtures("refuted")
+def test_searches_know_what_changes_have_added() -> None:
+    searcher = Scripted(found(VISCOUS), found(VISCOUS))
+    estimator, diagnosis = watched(searcher)
+    assert estimator.smoother is not None
+    estimator.smoother.state.added = ["coulomb_friction@joint_1.torque"]
+    estimator.smoother.renew()
+    estimator.push(resting(0.0, 33.0))
+    added = Effect(name="coulomb_friction", where="joint_1").key
+    assert [effect.key for effect in searcher.requests[0].system.effects] == [added]
+    assert sorted(effect.key for effect in diagnosis.system.effects) == [added, "viscous_friction@joint_1"]
+
+
+@pytest.mark.usefixtures("refuted")
+def test_no_search_begins_with_the_last_samples() -> None:
+    searcher = Scripted()
+    estimator, _ = watched(searcher)
+    estimator.push(resting(0.0, 10.05))
+    estimator.finish()
+    assert searcher.spans == []
+
+
+def test_sessions_without_any_fit_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    def work(self: Smoother, *_: object, **__: object) -> None:
+        self.state.known = self.known._replace(failures=("0 … 10 s: no motion explains the samples",))
+
+    monkeypatch.setattr(Smoother, "work", work)
+    searcher = Scripted(found(FRICTION), found(FRICTION))
+    estimator, diagnosis = watched(searcher)
+    estimator.push(resting(0.0, 33.0))
+    assert keys(diagnosis) == ["coulomb_friction@joint_1"]
 
 
 def test_nothing_is_searched_where_samples_agree(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from sms_online.diagnosis.online_search import search
-from sms_online.diagnosis.searcher import Outcome, RecordedRequest, Request, Searcher
+from sms_online.diagnosis.searcher import AnyRequest, Outcome, Searcher
 from sms_online.errors import InputError
 
 NAME = "searches.jsonl"
@@ -25,7 +25,7 @@ class Repeated:
         self._blocks, self._lost, self._begun = used | lost, lost, begun
         self._done: tuple[int, Outcome | None] | None = None
 
-    def submit(self, number: int, request: Request | RecordedRequest) -> bool:
+    def submit(self, number: int, request: AnyRequest) -> bool:
         """See `Searcher`."""
         if self._done is not None:
             return False

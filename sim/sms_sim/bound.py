@@ -19,7 +19,7 @@ from sms_online.linearised import Motion
 from sms_online.model.base_parameters import find_base_parameters
 from sms_online.model.readings import readable_channels
 from sms_online.pipeline.estimator import Estimator
-from sms_online.priors import base_prior
+from sms_online.priors import known_beforehand
 from sms_online.sensor_set import SensorSet, sensor_set
 from sms_online.stream import Array
 from sms_online.tables import Tabled
@@ -123,8 +123,8 @@ def bound(
         raise InputError("bound", "--grade, --each-sensor", "given", expected)
     recorded = recorded_session(system, data, folder)
     estimator = Estimator(system, tuple(recorded.source.channels), recorded.name)
-    if system.priors:
-        estimator.set_prior(base_prior(system, estimator.base, prior=False))
+    if (prior := known_beforehand(system, estimator.base, prior=False)) is not None:
+        estimator.set_prior(prior)
     record = MotionRecord(system.sample_rate)
     estimator.observers.append(record)
     for block in recorded.source:

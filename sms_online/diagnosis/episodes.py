@@ -14,6 +14,8 @@ from sms_online.verdict.evidence import Discrepancy
 # width; and of one that may have been there all the time, when so many are remembered: 4, 6, 8, 12 and 16 s.
 DUE = (3.0, 5.0, 8.0, 12.0, 18.0, 30.0)
 DUE_FROM_THE_START = (10.0, 15.0, 20.0, 30.0, 40.0)
+# Verdicts of searches that have found what is lacking.
+FOUND = ("named", "mistake")
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,11 @@ class Episode:
 
     noticed: s, samples up to then were there. row: type of the rows that leave most, "" where the smoother has noticed
     it, which has no rows of such types; began: s, None where it may have been there from the start. verdict: "noticed",
-    "named", "unexplained", "passed" where the last samples show nothing of it, "change" where a jump of parameters, the
-    event, explains it, or "drift" where parameters drift, and the judged tracker follows them. named_at: s, when a
-    search first named what was found in the end, when the event was decided, or when the tracker found the drift.
-    adopted: s, when the model was updated with what was named; refused: why not. drifting: names of parameters.
+    "named", "mistake", "unexplained", "passed" where the last samples show nothing of it, "change" where a jump of
+    parameters, the event, explains it, or "drift" where parameters drift, and the judged tracker follows them.
+    named_at: s, when a search first named what was found in the end, when the event was decided, or when the tracker
+    found the drift. adopted: s, when the model was updated with what was named; refused: why not. drifting: names of
+    parameters. mistakes: of units, signs and wiring, a sentence each.
     """
 
     noticed: float
@@ -66,6 +69,7 @@ class Episode:
     refused: str | None = None
     event: Event | None = None
     drifting: tuple[str, ...] = ()
+    mistakes: tuple[str, ...] = ()
     evidence: list[SearchAnswer] = field(default_factory=list)
 
 
@@ -75,6 +79,8 @@ def line(episode: Episode) -> str:
     if episode.row:
         what = f"the residual of {episode.row} exceeds its predicted noise"
     where = f"{what} since {episode.noticed:.2f} s"
+    if episode.verdict == "mistake":
+        return f"{where}: {'; '.join(episode.mistakes)}"
     if episode.verdict == "named":
         effects = ", ".join(_described(named) for named in episode.named)
         taken = ""
@@ -114,7 +120,7 @@ def discrepancy(episode: Episode) -> Discrepancy:
     if episode.verdict in ("noticed", "unexplained"):
         named = nearest.keys if (nearest := _nearest(episode)) is not None else ()
     adopted, refused = episode.adopted is not None, episode.refused is not None
-    return Discrepancy(episode.row, episode.noticed, episode.verdict, named, adopted, refused)
+    return Discrepancy(episode.row, episode.noticed, episode.verdict, named, adopted, refused, episode.mistakes)
 
 
 def _described(named: Named) -> str:
@@ -123,7 +129,7 @@ def _described(named: Named) -> str:
         for name, (value, std, unit) in named.coefficients.items()
     )
     others = f", or {', '.join(named.ambiguous)}" if named.ambiguous else ""
-    return f"{named.key}{others} ({values})"
+    return f"{named.key}{others}" + (f" ({values})" if values else "")
 
 
 def episode_document(episode: Episode) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from sms_online.diagnosis.record import bounded, excerpts
 from sms_online.diagnosis.reported import of_constant, of_unknowns
 from sms_online.diagnosis.residuals import ResidualTest
 from sms_online.diagnosis.rows import SessionRows
-from sms_online.diagnosis.searcher import Named, Outcome, RecordedRequest, Request
+from sms_online.diagnosis.searcher import REPORTED, AnyRequest, Named, Outcome, RecordedRequest, Request
 from sms_online.diagnosis.weak_windows import WeakWindows
 from sms_online.effects.build import build_model, declaring, with_effects
 from sms_online.effects.catalogue import ENTRIES, declarable
@@ -47,8 +47,6 @@ LEAST_SHARE = 0.01
 # Times that rows are whitened in a search at most: one effect takes some fifteen, three some forty. A session that
 # lacks more is for `diagnose`.
 MOST_WHITENINGS = 80
-# Candidates whose evidence is reported, the best ones.
-REPORTED = 8
 
 
 class Immediate:
@@ -57,7 +55,7 @@ class Immediate:
     def __init__(self) -> None:
         self._done: tuple[int, Outcome | None] | None = None
 
-    def submit(self, number: int, request: Request | RecordedRequest) -> bool:
+    def submit(self, number: int, request: AnyRequest) -> bool:
         """See `Searcher`."""
         self._done = number, search(request)
         return True
@@ -105,7 +103,7 @@ class _Bounded(Hypothesis):
 
 
 @one_blas_thread()
-def search(request: Request | RecordedRequest) -> Outcome | None:
+def search(request: AnyRequest) -> Outcome | None:
     """Trace what the record holds beyond the model; None where it is too short, or its rows are degenerate."""
     if isinstance(request, RecordedRequest):
         # Sessions without the smoother need none of it.

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from sms_online.description.schema import Effect, System
-from sms_online.diagnosis.episodes import Episode, SearchAnswer, discrepancy, episode_document, line
-from sms_online.diagnosis.searcher import Outcome, RecordedRequest, Request, Searcher
+from sms_online.diagnosis.episodes import FOUND, Episode, SearchAnswer, discrepancy, episode_document, line
+from sms_online.diagnosis.searcher import AnyRequest, Outcome, Searcher
 from sms_online.effects.build import with_effects
 from sms_online.grouping import grouped
 from sms_online.pipeline.estimator import Estimator
@@ -68,7 +68,7 @@ class RunningDiagnosis(Observer):
         """Time of the newest sample, s."""
         raise NotImplementedError
 
-    def _submit(self, request: Request | RecordedRequest) -> None:
+    def _submit(self, request: AnyRequest) -> None:
         """Have samples up to now searched, unless the searcher leaves that out."""
         if self.searcher.submit(self._begun, request):
             self._pending = self._begun, self._now
@@ -86,17 +86,20 @@ class RunningDiagnosis(Observer):
         return None if done[1] is None else SearchAnswer(time, self._now, done[1])
 
     def _answered(self, episode: Episode, answer: SearchAnswer) -> bool:
-        """Add the answer of a search to an episode; whether it names what the one before it has named."""
+        """Add the answer of a search to an episode; whether it finds what the one before it has found."""
         outcome = answer.outcome
         before = episode.evidence[-1].outcome if episode.evidence else None
         episode.evidence.append(answer)
         self.on_evidence(answer.known, outcome.scores)
-        if outcome.verdict != "named":
-            episode.verdict, episode.named, episode.named_at = "noticed", (), None
+        if outcome.verdict not in FOUND:
+            withdrawn = episode.verdict in FOUND
+            episode.verdict, episode.named, episode.named_at, episode.mistakes = "noticed", (), None, ()
+            if withdrawn:
+                self.on_verdict(answer.known, line(episode))
             return False
-        again = before is not None and before.verdict == "named" and before.keys == outcome.keys
+        again = before is not None and before.found == outcome.found
         if not again:
             episode.named_at = answer.known
-        episode.verdict, episode.named = "named", outcome.named
+        episode.verdict, episode.named, episode.mistakes = outcome.verdict, outcome.named, outcome.mistakes
         self.on_verdict(answer.known, line(episode))
         return again

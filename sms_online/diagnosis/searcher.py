@@ -9,10 +9,14 @@ from sms_online.description.schema import Effect, System
 from sms_online.diagnosis.record import Segment
 from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
+from sms_online.pipeline.events import Event
 from sms_online.pipeline.sensing import Sensing
 from sms_online.pipeline.sensor_noise import SensorNoise
 from sms_online.stream import Array, Block
 from sms_online.trackers.interface import Prior
+
+# Candidates whose evidence is reported, the best ones.
+REPORTED = 8
 
 
 @dataclass(frozen=True)
@@ -39,13 +43,18 @@ class Request:
 class RecordedRequest:
     """Samples as they came, of a session whose parameters come from the smoother: they are diagnosed as a capture is.
 
-    source: names them. prior: what is known beforehand, see `priors.given_prior`.
+    system: with what events have added. source: names the samples. prior: what is known beforehand, see
+    `priors.given_prior`; events: before the samples, behind which less of it is known.
     """
 
     system: System
     blocks: tuple[Block, ...]
     source: str
     prior: bool | dict[str, Any]
+    events: tuple[Event, ...] = ()
+
+
+AnyRequest = Request | RecordedRequest
 
 
 @dataclass(frozen=True)
@@ -85,9 +94,10 @@ class Named:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The answer of a search: verdict "clean", "named" or "unexplained".
+    """The answer of a search: verdict "clean", "named" or "unexplained", or "mistake" where samples hold one.
 
-    named: the effects found, also where they leave more than noise. scores: gain of the best candidates alone, by key.
+    named: the effects found, also where they leave more than noise. mistakes: of units, signs and wiring, a sentence
+    each; effects beside them are there once they are undone. scores: gain of the best candidates alone, by key.
     left: share of what was beyond noise that is left. began: whether the effects are absent from the segments before
     the late ones. beta (n,): parameters with the effects. ended: so much is lacking that the search ended before it
     had found all.
@@ -100,17 +110,23 @@ class Outcome:
     began: bool
     beta: Array
     ended: bool = False
+    mistakes: tuple[str, ...] = ()
 
     @property
     def keys(self) -> tuple[str, ...]:
         """What was found, in an order that does not depend on that of the search."""
         return tuple(sorted(named.key for named in self.named))
 
+    @property
+    def found(self) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+        """What two searches have to agree on."""
+        return self.verdict, self.keys, self.mistakes
+
 
 class Searcher(Protocol):
     """Makes searches, one at a time."""
 
-    def submit(self, number: int, request: Request | RecordedRequest) -> bool:
+    def submit(self, number: int, request: AnyRequest) -> bool:
         """Begin a search; False where this one is left out."""
 
     def outcome(self, block: int) -> tuple[int, Outcome | None] | None:

@@ -5,7 +5,7 @@ that falls step by step act on every coordinate, so that at first the motion fol
 follow the motion, as in a fit of the balance; a start that is tens of percent off then suffices. Where the samples
 refute exact equations, the least level stays that they agree with.
 Source: Ramsay, Hooker, Campbell, Cao, J. Royal Statistical Society B 69 (2007) 741, for the path from loose to tight
-equations; Bell, SIAM J. Optimization 4 (1994) 626, for the iterated smoother as Gauss-Newton.
+equations.
 """
 
 from __future__ import annotations
@@ -124,8 +124,8 @@ class SpanSmoother(SmoothedReadings):
                 with suppress(*NO_NUMBERS):
                     if (fit := search.exact(LEVELS[1:], STEPS)) is not None:
                         return fit
-                    if any(map(search.leaves_as_much, inexact)):
-                        refuted = True
+                    if any(map(search.is_minimum_of, inexact)):
+                        refuted = not search.would_fall()
                     else:
                         inexact.append(search)
             if refuted:
@@ -139,13 +139,15 @@ class SpanSmoother(SmoothedReadings):
             except NO_NUMBERS as error:
                 why = str(error)
                 continue
-            fits.append(fit)
             if fit.level > 0.0:
                 # A start that is far off may end there too. From this one, which is near, exact equations are met if
                 # they hold.
                 with suppress(*NO_NUMBERS):
-                    fits.append(Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS))
-            if fits[-1].inexact <= NEARLY_EXACT or any(map(fits[-1].allows_as_much, fits[:-1])):
+                    again = Search(self, span, fit.beta, known, search.reach).through(LEVELS, STEPS)
+                    fit = min(fit, again, key=lambda each: each.inexact)
+            met_again = any(map(fit.is_minimum_of, fits))
+            fits.append(fit)
+            if met_again or fit.inexact <= NEARLY_EXACT:
                 break
         if not fits:
             raise DivergedError(why)

@@ -60,7 +60,8 @@ class GaussNewton:
     reach (n,): how far a step takes parameters that loose equations do not determine, as a standard deviation; 0 where
     that is not known. before: see `fit.SpanSmoother`. interval: from one computed derivative by displacements to the
     next, s; between them they are interpolated, and only steer the search. kept: parameters stay where they are while
-    equations are loose, as they do in a span that goes on from another.
+    equations are loose, as they do in a span that goes on from another. step: of the collocation, as it is asked for,
+    s; refined: β and motion when that was changed last.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class GaussNewton:
         self._asked, self._relaxation, self._torque_noise = np.zeros(beta.size), 1.0, smoother.torque_noise
         t = span.nodes(ROUGH_STEP)
         self.motion = Motion(t, *span.guess(t))
+        self.step, self.refined = ROUGH_STEP, (beta, self.motion)
         _, force = momenta_and_forces(smoother.dynamics(beta), self.motion.x, self.motion.v)
         self._usual_force, self._usual_speed = _usual(force), _usual(self.motion.v)
         if not self._has_mass(beta):
@@ -100,10 +102,10 @@ class GaussNewton:
         """Put the motion on nodes at no more than `step`, s."""
         t = self._span.nodes(step)
         old = self.motion
-        if t.size == old.t.size:
-            return
-        self.motion = Motion(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
-        self._use_nodes()
+        if t.size != old.t.size:
+            self.motion = Motion(t, interpolated(old.t, old.x, t), interpolated(old.t, old.v, t))
+            self._use_nodes()
+        self.step, self.refined = step, (self.beta, self.motion)
 
     def hold(self, beta: Array) -> None:
         """Go on with β (n,), or with what is near it and a mechanism's, and leave it there."""

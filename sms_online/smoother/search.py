@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from sms_online.smoother.averaging import FEWEST_TARGETS, LONGEST_MISFIT, LONGEST_STEP, averaged
-from sms_online.smoother.gauss_newton import NO_NUMBERS, ROUGH_STEP, DivergedError, GaussNewton
+from sms_online.smoother.gauss_newton import EVERY_NODE, NO_NUMBERS, DivergedError, GaussNewton
 from sms_online.smoother.span import Ending
 from sms_online.stream import Array
 from sms_online.trackers.factor import solve, triangular_factor
@@ -21,9 +22,9 @@ REFINED = 1.0
 ALLOWED = (0.001, 0.003, 0.01, 0.03)
 # Before them, times the noise that samples of the torques show: coloured noise, ripple, and friction that follows no
 # law act beside the torques, and leave the equations of all other coordinates exact. So many times at most, and each
-# time by so much more at least; by as much where it is not known how much is lacking. Far too much of it would leave
-# the scale of all parameters to the noise of the positions, so a little more than noise may be left.
-MOST_TORQUE_NOISE, LEAST_RISE, UNKNOWN_RISE = 100.0, 1.5, 3.0
+# time by so much more at least and at most; by as much where it is not known how much is lacking. Far too much of it
+# would leave the scale of all parameters to the noise of the positions, so a little more than noise may be left.
+MOST_TORQUE_NOISE, LEAST_RISE, MOST_RISE, UNKNOWN_RISE = 100.0, 1.5, 10.0, 3.0
 LITTLE_MORE = 1.5
 # A level is tried again while the innovations are larger than noise makes them, so often at most.
 MOST_TRIES = 3
@@ -72,15 +73,14 @@ class SpanFit:
         """How far from exact the equations are, to compare fits by."""
         return self.level, self.torque_noise
 
-    def allows_as_much(self, other: SpanFit) -> bool:
-        """Whether it allows for as much as another fit: they have met one minimum."""
-        return self.level == other.level and abs(self.torque_noise - other.torque_noise) < SAME * other.torque_noise
+    def is_minimum_of(self, other: SpanFit) -> bool:
+        """Whether another fit, from another start, has met the same minimum, and allows for as much."""
+        as_much = self.level == other.level and abs(self.torque_noise - other.torque_noise) < SAME * other.torque_noise
+        return as_much and _near(self.factor, self.beta - other.beta, 1.0)
 
 
 class Search(GaussNewton):
     """A search that goes on until β converges, with steps of the collocation as fine as that asks for."""
-
-    _size = ROUGH_STEP  # of the collocation's steps, as they are asked for, s
 
     def through(self, levels: Sequence[float], steps: Sequence[float], exactly: bool = False) -> SpanFit:
         """The fit, by way of white forces of so many levels, with equations that hold as well as the samples allow.
@@ -96,7 +96,7 @@ class Search(GaussNewton):
     def exact(self, levels: Sequence[float], steps: Sequence[float], strictly: bool = False) -> SpanFit | None:
         """The fit with equations that hold, None where samples do not agree with any; see `through`.
 
-        strictly: it is to converge, and to leave no more than noise.
+        strictly: it is to converge to one β, and to leave no more than noise.
         """
         for level in levels:
             self.loosen(level)
@@ -107,14 +107,12 @@ class Search(GaussNewton):
                     return None
         for k, step in enumerate(steps):
             self.refine(step)
-            self._size = step
-            self._rough = before = self.beta, self.motion
-            left = self.mean_square
+            before, left = self.beta, self.mean_square
             if not self.converge(0.0, strictly=strictly):
                 break
             if k and self.mean_square > max(LARGEST_MISFIT, OF_STEPS * left):
                 break
-            if k and np.all(np.abs(self.beta - before[0]) <= REFINED * self.std):
+            if k and np.all(np.abs(self.beta - before) <= REFINED * self.std):
                 break
         fits = self.mean_square <= (LARGEST_MEAN_SQUARE if strictly else LARGEST_MISFIT)
         return self._taken(0.0) if fits else None
@@ -125,9 +123,9 @@ class Search(GaussNewton):
         while self._torque_noise < MOST_TORQUE_NOISE:
             rise = UNKNOWN_RISE
             if np.isfinite(self.mean_square):
-                rise = max(LEAST_RISE, float(np.sqrt(self.mean_square)))
+                rise = float(np.clip(np.sqrt(self.mean_square), LEAST_RISE, MOST_RISE))
             else:
-                self.beta, self.motion = self._rough
+                self.beta, self.motion = self.refined
             self._torque_noise = min(MOST_TORQUE_NOISE, rise * self._torque_noise)
             if self.converge(0.0) and self.mean_square <= LARGEST_MISFIT:
                 near = self._taken(0.0)
@@ -137,7 +135,7 @@ class Search(GaussNewton):
             return near
         self._torque_noise = least
         for level in ALLOWED:
-            self.beta, self.motion = self._rough
+            self.beta, self.motion = self.refined
             if self.converge(level) and self.mean_square <= LARGEST_MEAN_SQUARE:
                 return self._taken(level)
         raise DivergedError(f"no motion and no parameters explain the samples, after {self.iterations} steps")
@@ -147,14 +145,22 @@ class Search(GaussNewton):
         beyond = self.mean_square if self.mean_square > LARGEST_MEAN_SQUARE else 1.0
         factor = self.factor / np.sqrt(beyond)
         return SpanFit(
-            factor, self.beta, self.rows, self.mean_square, level, self._torque_noise, self._size, self.ending
+            factor, self.beta, self.rows, self.mean_square, level, self._torque_noise, self.step, self.ending
         )
 
-    def leaves_as_much(self, other: Search) -> bool:
-        """Whether it has led to the same mean square as another search: they have met one minimum."""
-        return (
-            bool(np.isfinite(self.mean_square)) and abs(self.mean_square - other.mean_square) < SAME * other.mean_square
-        )
+    def is_minimum_of(self, other: Search) -> bool:
+        """Whether another search, from another start, has met the same minimum."""
+        left = self.mean_square
+        as_much = bool(np.isfinite(left)) and abs(left - other.mean_square) < SAME * other.mean_square
+        return as_much and _near(self.factor, self.beta - other.beta, left)
+
+    def would_fall(self) -> bool:
+        """Whether derivatives at every node lead on from where those that are interpolated have led."""
+        finer = copy(self)
+        finer._interval = EVERY_NODE
+        with suppress(*NO_NUMBERS):
+            finer.advance(0.0)
+        return finer.mean_square < HALF * self.mean_square
 
     def loosen(self, level: float) -> None:
         """Follow the samples with white forces of a level."""
@@ -167,7 +173,7 @@ class Search(GaussNewton):
     def converge(self, level: float, wanted: slice = slice(None), tame: bool = False, strictly: bool = False) -> bool:
         """Search until β, or what is wanted, converges, scatters within its errors or is refuted; whether it does.
 
-        strictly: it is to converge.
+        strictly: to scatter within its errors does not count.
         """
         self._held = False
         targets: list[Array] = []
@@ -191,3 +197,9 @@ class Search(GaussNewton):
             return True
         self.mean_square = np.inf
         return False
+
+
+def _near(factor: Array, apart: Array, mean_square: float) -> bool:
+    """Whether two β of one span are apart (n,) by no more than errors; factor, mean_square: what one of them leaves."""
+    n = apart.size
+    return float(np.sum((factor[:n, :n] @ apart) ** 2)) <= n * mean_square

@@ -81,9 +81,7 @@ class SmootherStatistics(NamedTuple):
     @property
     def contradicted(self) -> bool:
         """Whether samples contradict the equations of motion: parameters are off by more than error bars say."""
-        if self.level > 0.0 or self.torque_noise > 1.0:
-            return self.level > 0.0 or self.torque_noise > LARGEST_TORQUE_NOISE
-        return self.beyond > NOISE_WHITENED
+        return self.level > 0.0 or self.torque_noise > LARGEST_TORQUE_NOISE or self.beyond > NOISE_WHITENED
 
     @property
     def beyond(self) -> float:

@@ -18,7 +18,7 @@ class Discrepancy:
 
     row: type of the rows that leave most, "" where the smoother has none. noticed: s. effects: what was named,
     `name@where`, or what is nearest where nothing is. adopted: whether the model has been updated with them; refused:
-    whether it cannot be.
+    whether it cannot be. mistakes: of units, signs and wiring, a sentence each.
     """
 
     row: str
@@ -27,6 +27,7 @@ class Discrepancy:
     effects: tuple[str, ...] = ()
     adopted: bool = False
     refused: bool = False
+    mistakes: tuple[str, ...] = ()
 
     @property
     def unexplained(self) -> bool:

@@ -163,10 +163,10 @@ def _inexact(smoother: SmootherStatistics) -> list[Reason]:
     """What the smoother had to allow for. Nothing that acts there is white: it shifts parameters by more than that."""
     if smoother.level > 0.0:
         return [Reason("samples do not agree with the equations of motion", True, then=STATE_HELD)]
+    said = []
     if smoother.torque_noise > 1.0:
-        text = f"what acts beside the torques is {smoother.torque_noise:.0f} × their noise"
-        return [Reason(text, smoother.contradicted, then=STATE_HELD)]
-    if smoother.beyond == 1.0:
-        return []
-    text = f"innovations are {smoother.beyond:.2g} × their noise: forces on the joints do not quite follow their laws"
-    return [Reason(text, smoother.contradicted, then=STATE_HELD)]
+        said.append(f"what acts beside the torques is {smoother.torque_noise:.0f} × their noise")
+    if smoother.beyond > 1.0:
+        beyond = f"innovations are {smoother.beyond:.2g} × their noise"
+        said.append(f"{beyond}: forces on the joints do not quite follow their laws")
+    return [Reason(text, smoother.contradicted, then=STATE_HELD) for text in said]

@@ -81,9 +81,10 @@ def scaled(comparison: NominalComparison) -> list[Reason]:
 
 
 def lacking(discrepancies: Iterable[Discrepancy]) -> list[Reason]:
-    """Effects that the model is known to lack."""
+    """Effects that the model is known to lack, and mistakes that samples hold."""
     out = []
     for each in discrepancies:
+        out += [Reason(mistake, True, (), "mistake", then=DIAGNOSE) for mistake in each.mistakes]
         if each.verdict == "named" and not each.adopted:
             places = tuple(place(effect) for effect in each.effects)
             mark = ", ".join(dict.fromkeys(kind(effect) for effect in each.effects))

@@ -10,7 +10,7 @@ import pickle
 import sys
 
 from sms_online.diagnosis.online_search import search
-from sms_online.diagnosis.searcher import RecordedRequest, Request
+from sms_online.diagnosis.searcher import AnyRequest
 
 # The estimator and whoever else works on the machine come first.
 NICENESS = 10
@@ -24,7 +24,7 @@ def main() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
         while True:
-            request: Request | RecordedRequest = pickle.load(sys.stdin.buffer)
+            request: AnyRequest = pickle.load(sys.stdin.buffer)
             pickle.dump(search(request), answers)
             answers.flush()
     except (EOFError, BrokenPipeError):

@@ -12,7 +12,7 @@ from threading import Thread
 from typing import IO
 
 from sms_adapters.searches import BEGUN, LOST, NAME, USED
-from sms_online.diagnosis.searcher import Outcome, RecordedRequest, Request
+from sms_online.diagnosis.searcher import AnyRequest, Outcome
 
 
 class SearchProcess:
@@ -35,12 +35,12 @@ class SearchProcess:
         )
         self._log = (directory / NAME).open("w", encoding="utf-8", buffering=1)
         self._log.write(json.dumps({"adopt": adopt}) + "\n")
-        self._requests: SimpleQueue[tuple[int, Request | RecordedRequest] | None] = SimpleQueue()
+        self._requests: SimpleQueue[tuple[int, AnyRequest] | None] = SimpleQueue()
         self._done: SimpleQueue[tuple[str, int, Outcome | None]] = SimpleQueue()
         self._busy = False
         Thread(target=self._run, name="searches", daemon=True).start()
 
-    def submit(self, number: int, request: Request | RecordedRequest) -> bool:
+    def submit(self, number: int, request: AnyRequest) -> bool:
         """See `Searcher`."""
         if self._busy or self.problem is not None:
             return False
@@ -88,7 +88,7 @@ class SearchProcess:
                 return
 
 
-def _asked(request: Request | RecordedRequest, to: IO[bytes], back: IO[bytes]) -> Outcome | None:
+def _asked(request: AnyRequest, to: IO[bytes], back: IO[bytes]) -> Outcome | None:
     pickle.dump(request, to)
     to.flush()
     outcome: Outcome | None = pickle.load(back)
