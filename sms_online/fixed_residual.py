@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
+from sms_online.calibration.found import Calibration, held
 from sms_online.description.schema import System
 from sms_online.diagnosis.constants import corrected
 from sms_online.diagnosis.followed import least_samples
@@ -17,7 +18,6 @@ from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.relinearisation import NOISE_RENEWED, PASS_BAND
 from sms_online.pipeline.sensing import is_slow, stated_period
 from sms_online.pipeline.sensor_noise import NoiseEstimate, SensorNoise
-from sms_online.pipeline.torque_gains import GAIN
 from sms_online.predicted import Predicted
 from sms_online.stream import Array, Block
 
@@ -53,11 +53,13 @@ class FixedResidual:
             self._renewed = float(block.t[-1])
             self._noise = self._estimate.noise(self._session.periods, self._system)
 
-    def of(self, beta: Array, gains: Mapping[str, float]) -> tuple[dict[str, RowResidual], dict[str, Predicted]]:
+    def of(
+        self, beta: Array, calibration: Sequence[Calibration]
+    ) -> tuple[dict[str, RowResidual], dict[str, Predicted]]:
         """What parameters β (n,) leave by row type, and by spring and flexible link.
 
         Both are empty where there are too few samples, or noise has no effect; springs and links whose stiffness is no
-        parameter are left out. gains: share by which joints' torques are read too large, by name.
+        parameter are left out. calibration: what the description is off by.
         """
         session, noise, sensing = self._session, self._noise, self._session.sensing
         length, most = bounded(self._system)
@@ -71,9 +73,8 @@ class FixedResidual:
         except np.linalg.LinAlgError:
             # Readings that no shape of the links gives.
             return {}, {}
-        nuisances = rows.calibrated.nuisances
-        held = np.array([gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in nuisances])
-        residual = (rows.Y @ beta + rows.calibrated.columns @ held - rows.b) / rows.std
+        known = held(rows.calibrated.nuisances, calibration)
+        residual = (rows.Y @ beta + rows.calibrated.columns @ known - rows.b) / rows.std
         return ResidualTest(rows).of(residual), _elastic(rows, beta, residual)
 
 

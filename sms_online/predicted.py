@@ -12,8 +12,10 @@ from sms_online.verdict.reasons import NOISE_RESIDUAL
 
 # Parameters that predict another run within this multiple of what any parameters leave there hold for both.
 HOLDS = 1.15
-# And less than this share of a torque is none.
+# And this share of a torque beside it is none: gains of torques are known no better.
 NEGLIGIBLE = 0.01
+# Zeros of two encoders beside a spring are off by no more than so many of their tolerances.
+WITHIN = 3.0 * np.sqrt(2.0)
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Predicted:
         return {"left": self.left, "least": self.least, "whitened": noise[0], "limit": noise[1]}
 
     def _as_fitted(self, left: float) -> bool:
-        return left <= max(NEGLIGIBLE, HOLDS * self.least)
+        return left <= float(np.hypot(NEGLIGIBLE, HOLDS * self.least))
 
 
 @dataclass(frozen=True)
@@ -63,13 +65,22 @@ class PredictedTorque(Predicted):
     """Of a joint's torque or force; a fit to this run is one of parameters and of a zero of each torque.
 
     zero: what its channel reads too much throughout if the prediction is right, in `unit`; zero_share: its size over
-    rms of the torque.
+    rms of the torque. turned: what deflections of its spring would be read too large by in its place, rad (m), 0
+    without a spring; tolerance: of an encoder's zero.
     """
 
     channel: str = ""
     unit: str = "N m"
     zero: float = 0.0
     zero_share: float = 0.0
+    turned: float = 0.0
+    tolerance: float = 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether the parameters hold here, with encoders whose zeros are within their tolerances."""
+        zeros = 0.0 < abs(self.turned) <= WITHIN * self.tolerance
+        return super().holds or (zeros and self._as_fitted(self.beside_zero))
 
     @property
     def beside_zero(self) -> float:
@@ -93,4 +104,5 @@ class PredictedTorque(Predicted):
             "unit": self.unit,
             "zero": self.zero,
             "beside_zero": self.beside_zero,
+            "turned": self.turned,
         }

@@ -23,7 +23,8 @@ class TorqueCourse:
     """A joint's torque or force over short windows, as its channel reads it.
 
     t (W,): middle of each window, s. measured (W,), predicted (W,): mean over it, weighted by its test function, in
-    `unit`.
+    `unit`. soft: by how much a deflection of its spring would have to be read too large, rad (m), for one `unit` of
+    torque; 0 where the joint has none.
     """
 
     channel: str
@@ -31,6 +32,7 @@ class TorqueCourse:
     t: Array
     measured: Array
     predicted: Array
+    soft: float = 0.0
 
     @property
     def left(self) -> float:
@@ -41,6 +43,11 @@ class TorqueCourse:
     def zero(self) -> float:
         """What the channel reads too much throughout, in `unit`, if the prediction is right."""
         return float(np.mean(self.measured - self.predicted))
+
+    @property
+    def turned(self) -> float:
+        """By how much zeros of the encoders beside its spring would have to be off in place of that, rad (m)."""
+        return -self.zero * self.soft
 
     @property
     def zero_share(self) -> float:
@@ -61,6 +68,9 @@ class TorquePrediction(Observer):
         self._balance = JointBalance(session.model, session.base, self._rate, sensing, gapless=True)
         self._unknowns = [each.unknowns(beta, known) for each in self._balance.state.residuals]
         self._free = np.setdiff1d(np.arange(beta.size), fixed)
+        stiffness = {p.name: value for p, value in zip(session.base.parameters, beta.tolist(), strict=True)}
+        springs = {i: stiffness.get(f"{joint_rows(i)}.stiffness", 0.0) for i in session.sensing.drives}
+        self._soft = {i: ratio / springs[i] if springs[i] else 0.0 for i, (_, ratio) in session.sensing.drives.items()}
         # Channel of each drive, and what one unit of it is in the rows.
         self._drives = {
             i: (channel, self._balance.weight * ratio) for i, (channel, ratio) in session.sensing.drives.items()
@@ -94,7 +104,7 @@ class TorquePrediction(Observer):
                 if measured.any():
                     channel, _ = self._drives[i]
                     unit = channel_unit(system, channel)
-                    out[joint_rows(i)] = TorqueCourse(channel, unit, start + t, measured, predicted)
+                    out[joint_rows(i)] = TorqueCourse(channel, unit, start + t, measured, predicted, self._soft[i])
         return out
 
     def least(self, courses: Mapping[str, TorqueCourse]) -> dict[str, float]:

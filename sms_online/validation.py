@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sms_online.calibration.columns import nuisances
+from sms_online.calibration.found import Calibration, held
 from sms_online.capture import check_channels
 from sms_online.cramer_rao import MotionRecord
 from sms_online.data import Data, recorded_session
@@ -23,7 +24,7 @@ from sms_online.model.base_parameters import BaseParameters
 from sms_online.model.model import Model
 from sms_online.physical import PhysicalSet
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.torque_gains import GAIN, gain_columns
+from sms_online.pipeline.torque_gains import gain_columns
 from sms_online.predicted import NEGLIGIBLE, Predicted, PredictedTorque
 from sms_online.result import Parameter, Parameters, Result
 from sms_online.stream import Array
@@ -128,14 +129,17 @@ class Validation(Tabled):
         shifted = sorted(self.joints.items(), key=lambda item: -item[1].zero_share)
         shifted = [each for each in shifted if each[1].shifted]
         zeros = listed([f"{each.channel} by {each.zero:+.2g} {each.unit}" for _, each in shifted])
+        lengths = {name: "m" if each.unit == "N" else "rad" for name, each in shifted}
+        turned = [f"{name} by {each.turned:+.2g} {lengths[name]}" for name, each in shifted if each.turned]
+        either = f", or of the encoders beside the spring of {listed(turned)}" if turned else ""
         name, worst = shifted[0]
         explained = all(each.beside_zero <= NOISE_RESIDUAL for each in self.joints.values())
         as_well = "The parameters hold on this run" if explained else AS_WELL
         left = f"{100.0 * worst.zero_share:.2g} % of the torque of {name}, beside which {100.0 * worst.beside_zero:.2g}"
         load = ", unless the arm carries another load" if self.gravity else ""
         return (
-            f"{as_well} but for the zeros of torques: {zeros}, {left} % is left. Zero the sensors before each run, or "
-            f"fit {declares('drive_offset')} to each{load}."
+            f"{as_well} but for the zeros of torques: {zeros}{either}: {left} % is left. "
+            f"Zero the sensors before each run, or fit {declares('drive_offset')} to each{load}."
         )
 
     def document(self) -> dict[str, Any]:
@@ -174,30 +178,30 @@ def validate(
     system: System,
     data: Data,
     parameters: Result | Parameters | Mapping[str, float] | None = None,
-    gains: Mapping[str, float] | None = None,
+    calibration: Sequence[Calibration] | None = None,
 ) -> Validation:
     """Predict the torques of recorded data with fixed parameters, and measure the error.
 
     data: as for `estimate`. parameters: values by name, or those of a `Result`; the nominal ones of the system file
-    unless given. Values without a deviation count as exact. gains: share by which the torques of some joints, by name,
-    are read too large; those that a `Result` has found unless given. Nothing is estimated from the data but for
+    unless given. Values without a deviation count as exact. calibration: what the description is off by, gains and
+    zeros of torques among it; what a `Result` has found unless given. Nothing is estimated from the data but for
     comparison.
     Raises InputError where the data do not fit the system, a parameter is missing, or there is no torque to predict.
     """
     if isinstance(parameters, Result):
-        found = {each.where: each.estimate for each in parameters.calibration if each.name == GAIN}
-        gains, parameters = found if gains is None else gains, parameters.parameters
+        calibration = parameters.calibration if calibration is None else calibration
+        parameters = parameters.parameters
     recorded = recorded_session(system, data)
     check_channels(tuple(recorded.source.channels), known_channels(system), recorded.name)
     # The rows of the joints' torques depend on no estimate; without a momentum balance no event changes the model.
     session = Estimator(system.model_copy(update={"balance": "energy"}), recorded.source.channels, recorded.name)
     beta = _values(session.base, system, parameters)
-    gains = gains or {}
-    # Where shapes are not measured, no session has estimated gains.
+    calibration = calibration or ()
+    # Where shapes are not measured, no session has estimated any.
     described = () if session.sensing.missing else nuisances(session.sensing)
-    held = np.array([gains.get(each.where, 0.0) if each.name == GAIN else 0.0 for each in described])
+    known = held(described, calibration)
     # A free gain would make a torque vanish.
-    prediction = TorquePrediction(session, beta, held, gain_columns(session.model, session.base, ()))
+    prediction = TorquePrediction(session, beta, known, gain_columns(session.model, session.base, ()))
     motion = MotionRecord(system.sample_rate)
     session.observers += [prediction, motion]
     channels = tuple(recorded.source.channels)
@@ -211,10 +215,18 @@ def validate(
     if not courses:
         raise InputError(recorded.name, "", "no torque, or too few samples", "a run with measured torques")
     least = prediction.least(courses)
-    by_type, deflections = ({}, {}) if residual is None else residual.of(beta, gains)
+    by_type, deflections = ({}, {}) if residual is None else residual.of(beta, calibration)
     joints = {
         name: PredictedTorque(
-            each.left, least[name], by_type.get(name), each.channel, each.unit, each.zero, each.zero_share
+            each.left,
+            least[name],
+            by_type.get(name),
+            each.channel,
+            each.unit,
+            each.zero,
+            each.zero_share,
+            each.turned,
+            system.tolerances.encoder_zero,
         )
         for name, each in courses.items()
     }

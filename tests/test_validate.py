@@ -67,11 +67,8 @@ def test_a_torque_sensor_with_another_zero_is_said_with_its_size(rig: Path) -> N
     system = sms.load_system(rig / "rig.toml")
     result = sms.estimate(system, rig / "monday.csv")
     tuesday = sms.read_capture(rig / "tuesday.csv")
-    torque = tuesday.channels.index("tau_1")
-    size = np.sqrt(np.mean(tuesday.values[:, torque] ** 2))
-    values = tuesday.values.copy()
-    values[:, torque] += 0.2 * size
-    found = sms.validate(system, replace(tuesday, values=values), result)
+    size = np.sqrt(np.mean(tuesday.values[:, tuesday.channels.index("tau_1")] ** 2))
+    found = sms.validate(system, shifted(tuesday, "tau_1", 0.2 * size), result)
     assert found.verdict == "shifted"
     assert not found.holds
     joint = found.joints["joint_1"]
@@ -79,6 +76,42 @@ def test_a_torque_sensor_with_another_zero_is_said_with_its_size(rig: Path) -> N
     assert joint.left == pytest.approx(0.2, abs=0.03)
     assert joint.beside_zero < 0.02
     assert "tau_1 by +" in found.sentence
+
+
+def shifted(capture: sms.Capture, channel: str, size: float) -> sms.Capture:
+    """The same with another zero of one channel."""
+    values = capture.values.copy()
+    values[:, capture.channels.index(channel)] += size
+    return replace(capture, values=values)
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-4])
+def test_zeros_of_encoders_are_told_from_those_of_torques_by_tolerance(rig: Path, tolerance: float) -> None:
+    system = sms.load_system(rig / "rig.toml")
+    tuesday = sms.read_capture(rig / "tuesday.csv")
+    # As much as the torque, by the spring.
+    size = np.sqrt(np.mean(tuesday.values[:, tuesday.channels.index("tau_1")] ** 2)) / STIFFNESS
+    scale = 1e-3 / size
+    capture = shifted(tuesday, "q_1", size)
+    result = sms.estimate(system, rig / "monday.csv")
+    within = system.tolerances.model_copy(update={"encoder_zero": tolerance / scale})
+    found = sms.validate(result.system.model_copy(update={"tolerances": within}), capture, result.parameters)
+    joint = found.joints["joint_1"]
+    assert joint.turned == pytest.approx(-size, rel=0.03)
+    assert joint.holds == (tolerance == 1e-3)
+    assert ("of the encoders beside the spring of joint_1 by" in found.sentence) != joint.holds
+
+
+def test_a_zero_that_the_first_run_has_found_is_used(rig: Path) -> None:
+    system = sms.load_system(rig / "rig.toml")
+    monday, tuesday = (sms.read_capture(rig / f"{day}.csv") for day in ("monday", "tuesday"))
+    size = 0.2 * np.sqrt(np.mean(tuesday.values[:, tuesday.channels.index("tau_1")] ** 2))
+    result = sms.estimate(system, shifted(monday, "tau_1", size))
+    (zero,) = (each for each in result.calibration if each.name == "drive_offset")
+    assert zero.estimate == pytest.approx(size * system.joints[0].gear_ratio, rel=0.1)
+    found = sms.validate(result.system, shifted(tuesday, "tau_1", size), result)
+    assert found.holds
+    assert not sms.validate(result.system, shifted(tuesday, "tau_1", size), result, calibration=()).holds
 
 
 @pytest.mark.slow

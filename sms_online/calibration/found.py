@@ -121,6 +121,12 @@ def _rounded(value: float, std: float) -> str:
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
+def held(nuisances: Sequence[Nuisance], calibration: Sequence[Calibration]) -> Array:
+    """Values (m,) of nuisances as earlier results have found them, 0 where they have not."""
+    known = {(each.name, each.where, each.part): each.estimate for each in calibration}
+    return np.array([known.get((each.name, each.where, each.part), 0.0) for each in nuisances])
+
+
 def found(nuisances: Sequence[Nuisance], values: Array, deviations: Array) -> list[Calibration]:
     """What is estimated better than its tolerance, and each gain; values, deviations (m,): of all.
 

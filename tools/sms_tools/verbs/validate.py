@@ -10,8 +10,8 @@ from rich.table import Table
 from sms_adapters.runs import NAME as RESULTS
 from sms_adapters.runs import read_results
 from sms_adapters.session_log import SYSTEM
+from sms_online.calibration.found import Calibration
 from sms_online.description.schema import System
-from sms_online.pipeline.torque_gains import GAIN
 from sms_online.recorded import Recorded
 from sms_online.result import Parameter, Parameters
 from sms_online.validation import validate
@@ -27,10 +27,10 @@ NAME = "validation.json"
 def run(args: argparse.Namespace) -> int:
     """Validate; 0, whether or not the parameters hold."""
     check_part(args)
-    system, parameters, gains, folder = _described(args)
+    system, parameters, calibration, folder = _described(args)
     directory = results_directory(args.out)
     with watched(args.capture, system, folder, args.start, args.stop) as reading:
-        found = validate(system, Recorded(reading, str(args.capture)), parameters, gains)
+        found = validate(system, Recorded(reading, str(args.capture)), parameters, calibration)
     path = write_document(directory / NAME, found.to_json())
     from sms_tools.html_report.validation_page import write_validation  # Matplotlib takes a second to be imported
 
@@ -44,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
     return OK
 
 
-def _described(args: argparse.Namespace) -> tuple[System, Parameters | None, dict[str, float], Path | None]:
-    """System, parameters and gains of a results.json or of a run's folder; of a system file its nominal values."""
+def _described(args: argparse.Namespace) -> tuple[System, Parameters | None, list[Calibration], Path | None]:
+    """System, parameters and calibration of a results.json or of a run's folder; of a system file nominal values."""
     path = Path(args.system)
     if path.is_dir() and (path / SYSTEM).exists() and not (path / RESULTS).exists():
         # The folder of a diagnosis.
@@ -53,8 +53,8 @@ def _described(args: argparse.Namespace) -> tuple[System, Parameters | None, dic
         args.system = str(path)
     if path.suffix != ".json" and not path.is_dir():
         system, folder = described_system(args)
-        return system, None, {}, folder
+        return system, None, [], folder
     document = read_results(path)
     values = Parameters(Parameter.of(p | {"std": p["std"] or None}) for p in document["parameters"])
-    gains = {each["where"]: float(each["estimate"]) for each in document["calibration"] if each["name"] == GAIN}
-    return System.model_validate(document["system"]), values, gains, None
+    calibration = [Calibration(**each) for each in document["calibration"]]
+    return System.model_validate(document["system"]), values, calibration, None
