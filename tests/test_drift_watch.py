@@ -18,7 +18,7 @@ from sms_online.session import with_trackers
 from sms_online.tracker_results import Consistency
 from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.judge import judge
-from sms_online.verdict.reasons import DIAGNOSE, FOLLOW, GO_ON
+from sms_online.verdict.reasons import DIAGNOSE, DIAGNOSED, FOLLOW, GO_ON
 from tests.axis import AXIS, MOTION
 from tests.bus_streams import axis_testbed
 
@@ -62,8 +62,12 @@ def test_rows_louder_than_the_error_bars_are_not_trusted() -> None:
         assert judge(replace(GOOD, consistency=Consistency(nis, 0.8, 1.2))).level == "trust"
     trust = judge(replace(GOOD, consistency=Consistency(1.4, 0.8, 1.2)))
     assert (trust.level, trust.grave) == ("doubt", False)
-    assert "innovations squared are 1.40, beyond 1.20" in trust.sentence
+    assert "1.2 × their noise (NIS 1.40, beyond 1.20)" in trust.sentence
     assert trust.grounds[0].then == DIAGNOSE
+    # A diagnosis is no next step where one has described the system.
+    diagnosed = judge(replace(GOOD, consistency=Consistency(1.4, 0.8, 1.2), diagnosed=True))
+    assert diagnosed.reasons == trust.reasons
+    assert diagnosed.next_step == DIAGNOSED
 
 
 @pytest.mark.parametrize(("seconds", "level"), [(0.0, "trust"), (59.0, "trust"), (61.0, "doubt")])

@@ -81,6 +81,7 @@ class Evidence:
     unwatched: s of a session in which no drift is watched for and none is followed; 0 elsewhere.
     consistency: of the judged tracker's rows with its error bars.
     scale: 1σ of the factor that all parameters have in common, where nothing else fixes it.
+    diagnosed: whether the system is what a diagnosis has found.
     """
 
     determined: tuple[int, int]
@@ -113,3 +114,4 @@ class Evidence:
     unwatched: float = 0.0
     consistency: Consistency | None = None
     scale: float | None = None
+    diagnosed: bool = False

@@ -67,6 +67,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
         unwatched=now.duration if now.method == "momentum" and momentum is not None and momentum.unwatched else 0.0,
         consistency=trackers[0].consistency if trackers else None,
         scale=now.setup.system.scale_tolerance,
+        diagnosed=bool(now.setup.system.fitted),
     )
 
 

@@ -18,7 +18,17 @@ from sms_online.verdict.trust import Reason, Trust
 
 
 def judge(evidence: Evidence) -> Trust:
-    """The verdict on a session.
+    """The verdict on a session."""
+    trust = _judged(evidence)
+    if not evidence.diagnosed:
+        return trust
+    # To send a person back to where the description comes from is no next step.
+    on = [replace(each, then=reasons.DIAGNOSED) if each.then == reasons.DIAGNOSE else each for each in trust.grounds]
+    return replace(trust, grounds=tuple(on))
+
+
+def _judged(evidence: Evidence) -> Trust:
+    """The same, of a system that no diagnosis has described.
 
     What has been shown to be wrong counts from when it is shown. Residuals of an estimate that has not converged show
     nothing: it was made of other, poorer rows.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -31,6 +32,10 @@ VITAL = ("mass", "mass_per_length", *ELASTIC)
 UNDECIDED = "ambiguous place"
 # What to do next.
 DIAGNOSE = "run `sms-online diagnose` on the recording"
+DIAGNOSED = (
+    "a diagnosis has described this system already: check it on another run, `sms-online validate`, "
+    "or let a curve be learned of what is left, `sms-online diagnose --learn`"
+)
 ADD_EFFECT = "run `sms-online diagnose` and replay with the system.toml that it writes"
 OR_ADOPT = f"{ADD_EFFECT}, or use --adopt"
 THEN_DIAGNOSE = ", then run `sms-online diagnose`"
@@ -304,7 +309,8 @@ def inconsistent(consistency: Consistency | None) -> list[Reason]:
     """Rows that leave more than the tracker's error bars say, where nothing else says why."""
     if consistency is None or consistency.nis is None or consistency.nis <= consistency.upper:
         return []
-    text = f"normalised innovations squared are {consistency.nis:.2f}, beyond {consistency.upper:.2f}"
+    limit = f"NIS {consistency.nis:.2f}, beyond {consistency.upper:.2f}"
+    text = f"all rows together leave {math.sqrt(consistency.nis):.2g} × their noise ({limit})"
     return [Reason(text, False, then=DIAGNOSE)]
 
 
