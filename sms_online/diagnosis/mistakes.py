@@ -17,7 +17,14 @@ from sms_online.description.channels import concerns, drive_channels
 from sms_online.description.schema import System
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rough_fit import SMALLEST, RoughFit, RoughRows, stretches
-from sms_online.diagnosis.sample_mistakes import MistakeHypothesis, mistake_hypotheses, scaled, shown, without_gaps
+from sms_online.diagnosis.sample_mistakes import (
+    MistakeHypothesis,
+    mistake_hypotheses,
+    scaled,
+    shown,
+    torque_mistakes,
+    without_gaps,
+)
 from sms_online.nominal import is_geared
 from sms_online.pipeline.estimator import Estimator
 from sms_online.sample_faults import unit_of_stamps
@@ -260,7 +267,7 @@ class _Search:
             return factors
 
         for which in dict.fromkeys(((*joints,), *((i,) for i in joints))):
-            for factor, hypothesis in self._causes(which):
+            for factor, hypothesis in torque_mistakes(self.system, which):
                 if likely(which, factor):
                     yield _Tried(hypothesis, rows.freed(times(which, factor)), len(which) == len(joints))
         for i in joints:
@@ -279,29 +286,6 @@ class _Search:
                 then = f"check the gear ratio of {where}, then its torque constant"
                 geared = MistakeHypothesis("gear_ratio", where, said, then, _same, _geared(i, best))
                 yield _Tried(hypothesis, rows.freed(times([i], best)), geared=geared)
-
-    def _causes(self, joints: Sequence[int]) -> Iterator[tuple[float, MistakeHypothesis]]:
-        """What torques of some joints may be in place of what they should, with the factor that undoes it."""
-        names = [self._drives[i] for i in joints]
-        gears = {self.system.joints[i].gear_ratio for i in joints}
-        listed, where = _listed(names), ", ".join(names)
-        unit = "N" if all(self.system.joints[i].kind == "prismatic" for i in joints) else "N m"
-        look, are = ("look", "are") if len(names) > 1 else ("looks", "is")
-        causes = [
-            (-1.0, "torque_sign", f"the sign of {listed} is inverted", f"invert the sign of {listed}"),
-            (1e-3, "torque_unit", f"{listed} {look} like m{unit} in place of {unit}", f"divide {listed} by 1000"),
-            (1e3, "torque_unit", f"{listed} {look} like k{unit} in place of {unit}", f"multiply {listed} by 1000"),
-        ]
-        if len(gears) == 1 and gears != {1.0} and names[0].startswith("tau"):
-            (n,) = gears
-            of = "the joint's torque in place of the motor shaft's"
-            once = f"{listed} {are} divided by the gear ratio {n:g} twice"
-            causes.append((1.0 / n, "joint_torque", f"{listed} {look} like {of}", f"divide {listed} by {n:g}"))
-            causes.append((n, "joint_torque", once, f"multiply {listed} by {n:g}"))
-        for factor, name, sentence, step in causes:
-            if len(joints) == len(self._drives) and factor > 0.0:
-                sentence = f"everything is {1.0 / factor:.3g} × its description: {sentence}"
-            yield factor, MistakeHypothesis(name, where, sentence, step, scaled(names, factor))
 
 
 @dataclass(frozen=True)
@@ -326,10 +310,6 @@ def _left(fit: RoughFit, explained: float = EXPLAINED) -> float:
     """Product over the coordinates, as likelihoods compare; what is explained counts as such."""
     fitted, stated = np.maximum(fit.left, explained) / explained, np.maximum(fit.nominal, AS_STATED) / AS_STATED
     return float(np.exp(np.sum(np.log(fitted)) + np.sum(np.log(np.minimum(stated, 1.0 / AS_STATED)))))
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def _same(channels: tuple[str, ...], values: Array) -> Array:

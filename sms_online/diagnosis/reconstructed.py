@@ -9,12 +9,14 @@ import numpy as np
 
 from sms_online.description.schema import System
 from sms_online.diagnosis.attempt import SEARCHED, PriorOf, Progress
-from sms_online.diagnosis.captures import in_seconds, one_after_another
+from sms_online.diagnosis.captures import in_seconds, one_after_another, undone
 from sms_online.diagnosis.diagnose import diagnose, run_through
+from sms_online.diagnosis.followed_mistakes import find_followed
 from sms_online.diagnosis.mistakes import Mistake, wrong_clock
 from sms_online.diagnosis.search import Search
 from sms_online.effects.build import build_model
 from sms_online.effects.catalogue import channel_effects
+from sms_online.errors import InputError
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.sensing import not_smoothed
 from sms_online.smoother.reconstruction import Reconstruction
@@ -45,8 +47,20 @@ def diagnose_recorded(
             # No motion follows samples at such times.
             runs, holdout = [in_seconds(run, clock.before) for run in runs], in_seconds(holdout, clock.before)
             mistakes = (clock,)
+    try:
+        first = reconstruction(runs[0])
+    except InputError:
+        progress("looking for units that are others", 0.0)
+        # What a trial leaves out is no concern of the capture.
+        wrong = find_followed(system, runs[0], Reconstruction(system, runs[0][0].channels, source))
+        if wrong is None:
+            raise
+        runs, holdout = [undone(run, wrong) for run in runs], undone(holdout, wrong)
+        mistakes = (*mistakes, *wrong.mistakes)
+        reconstruction = Reconstruction(system, runs[0][0].channels, source)
+        first = reconstruction(runs[0])
     held = reconstruction(holdout) if holdout else []
-    first, *further = map(reconstruction, runs)
+    further = [reconstruction(run) for run in runs[1:]]
     found = diagnose(reconstruction.system, first, source, prior, held, progress, stop, learned, further, channels)
     if not channels:
         return found, []

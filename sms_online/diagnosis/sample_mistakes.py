@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from sms_online.description.channels import channel_unit
+from sms_online.description.channels import channel_unit, drive_channels
 from sms_online.description.schema import System
 from sms_online.description.sources import LogSource
 from sms_online.diagnosis.record import Segment
@@ -72,6 +72,31 @@ def mistake_hypotheses(system: System, channels: Sequence[str]) -> Iterator[Mist
     yield from _geared(system, channels)
     yield from _counts(channels)
     yield from _swaps(channels)
+
+
+def torque_mistakes(system: System, joints: Sequence[int]) -> Iterator[tuple[float, MistakeHypothesis]]:
+    """What torques of some joints, by index, may be in place of what they should, with the factor that undoes it."""
+    drives = {i - 1: name for name, i in drive_channels(system).items()}
+    names = [drives[i] for i in joints]
+    gears = {system.joints[i].gear_ratio for i in joints}
+    listed, where = _listed(names), ", ".join(names)
+    unit = "N" if all(system.joints[i].kind == "prismatic" for i in joints) else "N m"
+    look, are = ("look", "are") if len(names) > 1 else ("looks", "is")
+    causes = [
+        (-1.0, "torque_sign", f"the sign of {listed} is inverted", f"invert the sign of {listed}"),
+        (1e-3, "torque_unit", f"{listed} {look} like m{unit} in place of {unit}", f"divide {listed} by 1000"),
+        (1e3, "torque_unit", f"{listed} {look} like k{unit} in place of {unit}", f"multiply {listed} by 1000"),
+    ]
+    if len(gears) == 1 and gears != {1.0} and names[0].startswith("tau"):
+        (n,) = gears
+        of = "the joint's torque in place of the motor shaft's"
+        once = f"{listed} {are} divided by the gear ratio {n:g} twice"
+        causes.append((1.0 / n, "joint_torque", f"{listed} {look} like {of}", f"divide {listed} by {n:g}"))
+        causes.append((n, "joint_torque", once, f"multiply {listed} by {n:g}"))
+    for factor, name, sentence, step in causes:
+        if len(joints) == len(drives) and factor > 0.0:
+            sentence = f"everything is {1.0 / factor:.3g} × its description: {sentence}"
+        yield factor, MistakeHypothesis(name, where, sentence, step, scaled(names, factor))
 
 
 def scaled(names: Sequence[str], factor: float) -> Callable[[tuple[str, ...], Array], Array]:
@@ -340,3 +365,7 @@ def _joined(column: Array) -> Array:
     """Straight lines between the held values, each at the start of its hold."""
     starts = np.concatenate(([0], np.flatnonzero(np.diff(column) != 0.0) + 1))
     return np.interp(np.arange(column.size), starts, column[starts])
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
