@@ -71,7 +71,7 @@ class Rows:
             calibration.extend(pi, piece.x, piece.v, piece.signals, rates, by_geometry)
         starts = np.array([window.start for window in found])
         sensitivity = sensitivities.windows(starts)
-        responses = np.array([window.rough for window in found])
+        responses = np.array([window.rough[1] for window in found])
         rough = balance.rough.kernels(responses, self.base.physical_values(self.beta), sensitivity.displacements)
         return np.concatenate(calibration.windows(starts, sensitivity, rough))
 

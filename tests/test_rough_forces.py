@@ -11,6 +11,7 @@ from sms_online.model.base_parameters import find_base_parameters
 from sms_online.pipeline.estimator import Estimator
 from sms_online.pipeline.momentum_balance import MomentumBalance
 from sms_online.pipeline.momentum_windows import COPIES, STEPS, Window
+from sms_online.pipeline.rough_forces import responses
 from sms_online.pipeline.standstill import Standstill
 from sms_online.stream import Array, Block
 from sms_sim.plant import Plant
@@ -55,7 +56,7 @@ def predicted(window: Window, sigma: float) -> float:
     rough = MomentumBalance(MODEL, BASE, RATE, SPAN).rough
     pi = np.zeros(MODEL.n_pi)
     pi[friction()] = 1.0
-    c = rough.kernels(window.rough[None], pi, np.eye(MODEL.layout.n_v)[None])[0, :, MOTOR, MOTOR]
+    c = rough.kernels(window.rough[:1], pi, np.eye(MODEL.layout.n_v)[None])[0, :, MOTOR, MOTOR]
     return float(np.sqrt(np.sum(c**2) * SPAN / STEPS * sigma**2 / RATE))
 
 
@@ -168,3 +169,28 @@ def test_a_session_with_internal_states_runs_at_a_low_rate() -> None:
     assert estimator.momentum is not None
     assert estimator.momentum.joint.grams.windows > 100
     assert np.isfinite(estimator.estimate().pi).all()
+
+
+def test_slow_displacements_of_readings_act_by_their_rate_where_friction_reverses() -> None:
+    """A constant one does nothing; one that goes on straight between steps acts as the sum over samples says."""
+    width, steps, rate = 150, 40, 250.0
+    t = np.linspace(0.0, 1.0, width + 1)
+    phi = (1.0 - (2.0 * t - 1.0) ** 2) ** 4
+    by_position = np.sin(9.0 * t)
+    by_rate = np.zeros(width + 1)
+    by_rate[[31, 32, 77, 118]] = 40.0, 25.0, 60.0, 50.0  # reversals
+    slow = responses(np.column_stack((by_position, by_rate)), phi, 6, rate, steps)[1][:, 0]
+    seconds = width / rate
+    at_steps, dt = np.linspace(0.0, 1.0, steps + 1), 1.0 / rate
+
+    def acts(displacement: Array) -> float:
+        """∫ c n dt by steps."""
+        return float(slow @ displacement) * seconds / steps
+
+    only_by_rate = responses(np.column_stack((0.0 * t, by_rate)), phi, 6, rate, steps)[1][:, 0]
+    assert abs(only_by_rate.sum()) < 1e-12 * np.abs(only_by_rate).sum()
+    expected = -dt * np.sum(phi * (by_position * (1.0 + 3.0 * t) + by_rate * 3.0 / seconds))
+    assert acts(1.0 + 3.0 * at_steps) == pytest.approx(expected, rel=1e-12)
+    # A wave, as of an error once a turn.
+    wave = -dt * np.sum(phi * (by_position * np.cos(3.0 * t) - by_rate * 3.0 / seconds * np.sin(3.0 * t)))
+    assert acts(np.cos(3.0 * at_steps)) == pytest.approx(wave, rel=0.01)

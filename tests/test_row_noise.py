@@ -116,7 +116,7 @@ def scatter(system: System, draws: int, seed: int) -> Scatter:
     density = POSITION_NOISE**2 / system.sample_rate, TORQUE_NOISE**2 / system.sample_rate
     sensitivity = sensitivities.windows(np.array([window.start for window in found]))
     kernels = noise.kernels(sensitivity)
-    responses = np.array([window.rough for window in found])
+    responses = np.array([window.rough[0] for window in found])
     kernels += probe.rough.kernels(responses, model.nominal, sensitivity.displacements)
     densities = np.full(model.layout.n_x, density[0]), np.full(len(model.layout.q), density[1])
     late = noise.lateness(kernels, sensitivity.rates)

@@ -131,7 +131,7 @@ class CalibrationColumns(Stage):
     def windows(self, starts: Indices, sensitivity: Sensitivity, rough: Array) -> Array:
         """N (W, n_v, count) of the windows that start at some instants.
 
-        rough (W, STEPS + 1, n_v, sensors): what rough forces add to c.
+        rough (W, STEPS + 1, n_v, sensors): what rough forces add to c, of slow displacements.
         """
         W, _, n_v, sensors = sensitivity.H.shape
         if not self.count:

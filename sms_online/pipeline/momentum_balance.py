@@ -260,7 +260,7 @@ class MomentumBalance(Stage):
             weak = -(phi_dot @ values[:, :width] + phi @ values[:, width : 2 * width]).reshape(COPIES, -1)
             b = (phi @ values[:, 2 * width :]).reshape(COPIES, -1) - weak[:, entries:]
             last = grid + window + self.width + self.lead
-            none = np.empty((STEPS + 1, 0)), np.empty((INSTANTS, 0))
+            none = np.empty((2, STEPS + 1, 0)), np.empty((INSTANTS, 0))
             moment = np.empty(0)
             if self.with_moments:
                 psi, psi_dot = self._moment_phi[s]

@@ -52,8 +52,8 @@ class Window:
     n_v). The first copy is that of the samples as measured, the others those of the samples with noise added.
     moment (nonzero,): Y of the first copy with the test function (t - t_c) φ, t_c the window's centre: what parameters
     add that change evenly, by their rates; empty where nobody asked. half_width: M of the filter.
-    rough (STEPS + 1, E): what noise does by way of rough forces, see `responses` of `rough_forces`. rest (INSTANTS, D):
-    see `RoughForces.at_rest`.
+    rough (2, STEPS + 1, E): what noise and slow displacements of readings do by way of rough forces, see `responses` of
+    `rough_forces`. rest (INSTANTS, D): see `RoughForces.at_rest`.
     """
 
     start: int

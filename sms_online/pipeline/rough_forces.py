@@ -144,7 +144,8 @@ class RoughForces:
     def kernels(self, responses: Array, pi: Array, readings: Array) -> Array:
         """What these forces add to `RowNoise.kernels` (W, steps, n_v, sensors), for parameters π (n_pi,).
 
-        responses (W, steps, E): of the windows. readings (W, n_v, sensors): displacements by each sensor's reading.
+        responses (W, steps, E): of the windows, of noise or of slow displacements. readings (W, n_v, sensors):
+        displacements by each sensor's reading.
         """
         out = np.zeros((*responses.shape[:2], *readings.shape[1:]))
         for row in np.unique(self.rows):
@@ -192,13 +193,32 @@ def _through_filter(half_width: int, width: int, steps: int) -> Array:
     return np.asarray(interpolation @ passed)
 
 
+@cache
+def _at_samples(width: int, steps: int) -> Array:
+    """(2, steps + 1, width + 1): what a slow displacement, by its values at steps, is at samples, and its rate there.
+
+    By the width of a window, and in the sum over samples per that over steps.
+    """
+    at, unit = np.linspace(0.0, 1.0, steps + 1), np.eye(steps + 1)
+    values = np.stack([np.interp(np.linspace(0.0, 1.0, width + 1), at, each) for each in unit])
+    slopes = np.stack([np.gradient(each, at, edge_order=2) for each in unit])
+    return np.asarray(np.stack((values, slopes @ values)) * steps / width)
+
+
 def responses(slopes: Array, phi: Array, half_width: int, sample_rate: float, steps: int) -> Array:
     """Responses of a row to displacements of a reading, by way of rough forces.
 
-    c (steps + 1, E): what a displacement n(t) of a reading adds to a row is ∫ c(t) n(t) dt, for unit coefficients.
+    c (2, steps + 1, E): what a displacement n(t) of a reading adds to a row is ∫ c(t) n(t) dt, for unit coefficients.
+    First of noise, which the filter passes in part, by single instants; then of what is slower than the steps, exactly
+    as far as it goes on straight between these: a sum over instants of the first would not show that a constant
+    displacement adds nothing by a rate.
 
     slopes (width + 1, 2 E): `RoughForces.slopes` along the window. phi (width + 1,): test function at the samples.
     """
-    by_value, by_change = _through_filter(half_width, phi.size - 1, steps)
+    width = phi.size - 1
+    by_value, by_change = _through_filter(half_width, width, steps)
+    values, rates = _at_samples(width, steps)
     by_position, by_rate = np.split(phi[:, None] * slopes, 2, axis=1)
-    return np.asarray(-(by_value @ by_position + sample_rate * (by_change @ by_rate)))
+    noise = by_value @ by_position + sample_rate * (by_change @ by_rate)
+    slow = values @ by_position + sample_rate / width * (rates @ by_rate)
+    return -np.stack((noise, slow))

@@ -151,10 +151,12 @@ class WindowNoise(Stage):
         starts = np.array([window.start for window in windows])
         sensitivity = self._sensitivities.windows(starts)
         ages = np.array([window.end for window in windows]) / self._sample_rate
-        rough = self._rough.kernels(np.array([window.rough for window in windows]), pi, sensitivity.displacements)
-        kernels = self._noise.kernels(sensitivity) + rough
+        responses = np.array([window.rough for window in windows]).swapaxes(0, 1)
+        rough, slow = (self._rough.kernels(each, pi, sensitivity.displacements) for each in responses)
+        smooth = self._noise.kernels(sensitivity)
+        kernels = smooth + rough
         free = self._rough.at_rest(np.array([window.rest for window in windows]), pi)
-        late = self._noise.lateness(kernels, sensitivity.rates)
+        late = self._noise.lateness(smooth + slow, sensitivity.rates)
         wrench = None
         if self._wrenches is not None:
             middles = starts + INSTANTS // 2 - self.state.first
@@ -168,7 +170,7 @@ class WindowNoise(Stage):
             diagonal += own
         calibration = np.empty((len(windows), self.n_v, 0))
         if self._calibration is not None:
-            calibration = self._calibration.windows(starts, sensitivity, rough)
+            calibration = self._calibration.windows(starts, sensitivity, slow)
         multiplied = self._multiplied.push(kernels, noise.sensors, torque)
         parts = zip(covariances, kernels, late, calibration, multiplied, strict=True)
         return [PropagatedNoise(*each) for each in parts]
