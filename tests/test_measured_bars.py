@@ -80,13 +80,7 @@ def test_halves_of_emps_agree_within_their_bars(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "unit",
-    [
-        "CTU",
-        pytest.param("maker", marks=pytest.mark.xfail(strict=True, reason="half of this run determines no spring")),
-    ],
-)
+@pytest.mark.parametrize("unit", ["CTU", "maker"])
 def test_halves_of_quanser_runs_agree_within_bars(tmp_path: Path, unit: str) -> None:
     capture, middle = measured(FACTORY), 9.7
     if unit == "CTU":
@@ -115,7 +109,6 @@ def test_two_axes_of_a_robot_are_not_determined() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="the second axis comes out as determined")
 def test_a_prior_determines_no_axis_of_a_robot() -> None:
     """Beside priors of ± 10 % the torque of axes 1 and 2 says nothing that is certain, that of axis 3 does."""
     system = load_system(str(measured(KUKA / "system.toml")))
