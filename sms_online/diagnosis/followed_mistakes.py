@@ -45,7 +45,8 @@ def find_followed(
 def _too_large(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     """Hypotheses of samples that are too large, those of most channels first."""
     joints = [i - 1 for name, i in drive_channels(system).items() if name in channels]
-    for which in dict.fromkeys(((*joints,), *((i,) for i in joints))):
+    together = [(*joints,)] if joints else []
+    for which in dict.fromkeys((*together, *((i,) for i in joints))):
         yield from (each for factor, each in torque_mistakes(system, which) if abs(factor) < 1.0)
     units = [each for each in mistake_hypotheses(system, channels) if each.name in UNITS]
     yield from sorted(units, key=lambda each: not each.where.startswith("all"))

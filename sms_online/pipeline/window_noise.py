@@ -31,8 +31,9 @@ class PropagatedNoise:
     """Noise of one window's rows.
 
     covariances: with those of the windows before, then their own; see `RowNoise.covariances`. kernel (STEPS + 1, n_v,
-    sensors): see `RowNoise.kernels`, rough forces included. late (n_v, sensors): see `RowNoise.lateness`. calibration
-    (n_v, ·): see `CalibrationColumns.windows`. multiplied (n_v, ·): see `MultipliedNoise`.
+    sensors): see `RowNoise.kernels`, with what slow displacements do by way of rough forces. late (n_v, sensors): see
+    `RowNoise.lateness`. calibration (n_v, ·): see `CalibrationColumns.windows`. multiplied (n_v, ·): see
+    `MultipliedNoise`.
     """
 
     covariances: list[Array]
@@ -154,9 +155,9 @@ class WindowNoise(Stage):
         responses = np.array([window.rough for window in windows]).swapaxes(0, 1)
         rough, slow = (self._rough.kernels(each, pi, sensitivity.displacements) for each in responses)
         smooth = self._noise.kernels(sensitivity)
-        kernels = smooth + rough
+        kernels, displaced = smooth + rough, smooth + slow
         free = self._rough.at_rest(np.array([window.rest for window in windows]), pi)
-        late = self._noise.lateness(smooth + slow, sensitivity.rates)
+        late = self._noise.lateness(displaced, sensitivity.rates)
         wrench = None
         if self._wrenches is not None:
             middles = starts + INSTANTS // 2 - self.state.first
@@ -172,5 +173,5 @@ class WindowNoise(Stage):
         if self._calibration is not None:
             calibration = self._calibration.windows(starts, sensitivity, slow)
         multiplied = self._multiplied.push(kernels, noise.sensors, torque)
-        parts = zip(covariances, kernels, late, calibration, multiplied, strict=True)
+        parts = zip(covariances, displaced, late, calibration, multiplied, strict=True)
         return [PropagatedNoise(*each) for each in parts]
