@@ -36,12 +36,13 @@ class Follower:
     def __init__(self) -> None:
         self.tried: list[float] = []
 
-    def __call__(self, blocks: Sequence[Block]) -> None:
+    def __call__(self, blocks: Sequence[Block]) -> list[Block]:
         (block,) = blocks
         self.tried.append(float(np.ptp(block.t)))
         size = np.abs(block.values).max(axis=0)
         if np.any(size > 1.5 * LARGEST) or np.any(size < 0.5 * LARGEST):
             raise InputError("capture", "", "no motion", "a motion")
+        return [block]
 
 
 @pytest.mark.parametrize(
@@ -55,11 +56,13 @@ class Follower:
 )
 def test_the_unit_with_which_a_motion_follows_is_named(factors: dict[str, float], key: str) -> None:
     follower, capture = Follower(), wrong(factors)
-    found = find_followed(BENCH, capture, follower)
-    assert found is not None
+    followed = find_followed(BENCH, capture, follower)
+    assert followed is not None
+    found, (as_followed,) = followed
     assert [mistake.key for mistake in found.mistakes] == [key]
     (corrected,) = undone(capture, found)
     np.testing.assert_allclose(corrected.values, VALUES, rtol=1e-12)
+    np.testing.assert_array_equal(as_followed.values, corrected.values)
     # Some seconds with large torques first, then all.
     assert max(follower.tried[:-1]) <= TRIED
     assert follower.tried[-1] > 5.0

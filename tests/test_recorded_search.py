@@ -41,7 +41,7 @@ def request(prior: bool = False, events: tuple[Event, ...] = ()) -> RecordedRequ
 
 @pytest.fixture
 def diagnosed(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """What the next diagnosis finds, to be changed; `prior`: what it was told is known beforehand."""
+    """What the next diagnosis finds, to be changed; `prior`: what it was given as known beforehand."""
     now = SimpleNamespace(verdict="named", mistakes=(), left=0.01, entries=[ENTRY], prior=None)
     now.adopted = declaring(BENCH, [EFFECT])
     ranked = [SimpleNamespace(candidate=SimpleNamespace(key=f"effect_{k}"), gain=1.0) for k in range(REPORTED + 3)]

@@ -26,9 +26,9 @@ TRIED = 2.0
 
 
 def find_followed(
-    system: System, run: Sequence[Block], follow: Callable[[Sequence[Block]], object]
-) -> Corrected | None:
-    """What to undo in a capture so that a motion follows it; None where nothing helps.
+    system: System, run: Sequence[Block], follow: Callable[[Sequence[Block]], list[Block]]
+) -> tuple[Corrected, list[Block]] | None:
+    """What to undo in a capture so that a motion follows it, and the capture as followed; None where nothing helps.
 
     follow: raises InputError where no motion does.
     """
@@ -37,8 +37,7 @@ def find_followed(
         found = Corrected((_mistake(hypothesis),), hypothesis.apply, system)
         with suppress(InputError):
             follow(undone(some, found))
-            follow(undone(run, found))
-            return found
+            return found, follow(undone(run, found))
     return None
 
 

@@ -51,14 +51,12 @@ def diagnose_recorded(
         first = reconstruction(runs[0])
     except InputError:
         progress("looking for units that are others", 0.0)
-        # What a trial leaves out is no concern of the capture.
-        wrong = find_followed(system, runs[0], Reconstruction(system, runs[0][0].channels, source))
-        if wrong is None:
+        followed = find_followed(system, runs[0], reconstruction)
+        if followed is None:
             raise
+        wrong, first = followed
         runs, holdout = [undone(run, wrong) for run in runs], undone(holdout, wrong)
         mistakes = (*mistakes, *wrong.mistakes)
-        reconstruction = Reconstruction(system, runs[0][0].channels, source)
-        first = reconstruction(runs[0])
     held = reconstruction(holdout) if holdout else []
     further = [reconstruction(run) for run in runs[1:]]
     found = diagnose(reconstruction.system, first, source, prior, held, progress, stop, learned, further, channels)

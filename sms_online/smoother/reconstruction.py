@@ -74,7 +74,7 @@ class Reconstruction:
 
     available: channels of the captures; source: names them in messages. system: as described, but with a reading of
     every coordinate. channels: those of its readings that are reconstructed; none where nothing has to be. failures:
-    spans that were left out and why, a sentence each.
+    spans of captures that were left out and why, a sentence each.
     Raises InputError as `Sensing` and `Estimator` do.
     """
 
@@ -133,10 +133,10 @@ class Reconstruction:
         for block in blocks:
             estimator.push(block)
         estimator.finish()
-        self.failures += follower.failures
         if not follower.motions:
             why = follower.failures[0] if follower.failures else "no motion without a gap of half a second"
             raise InputError(self._source, "", why, "samples that some motion of the described system explains")
+        self.failures += follower.failures
         return self._merged(blocks, follower.motions)
 
     def _merged(self, blocks: Sequence[Block], motions: Sequence[Motion]) -> list[Block]:
