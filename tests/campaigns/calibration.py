@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -24,6 +25,8 @@ from scipy.spatial.transform import Rotation
 
 from sms_adapters.system_file import load_system
 from sms_online.description.schema import System, Tolerances
+from sms_online.effects.build import declaring
+from sms_online.effects.catalogue import parse_effect
 from sms_online.evaluation import NORMAL_95
 from sms_online.pipeline.snapshot import statistics_of
 from sms_online.stream import Array, Block
@@ -37,6 +40,11 @@ GRADE = "B"
 TOLERANCES = ("none", "default")
 PIECE = 1000  # samples
 WITHIN = 3.0  # standard deviations of a nuisance
+# What is declared where a kind has friction.
+FRICTION = (
+    "coulomb_friction@joint_1:torque=8", "viscous_friction@joint_1:damping=5",
+    "coulomb_friction@joint_2:torque=4", "viscous_friction@joint_2:damping=3",
+)  # fmt: skip
 # The true arm where its geometry is another than the described one.
 LENGTH, AXIS = 1.2e-4, 5e-4  # m, rad: of link 1, and of joint 2
 
@@ -143,6 +151,26 @@ def _coloured(exact: Block, block: Block, time: float) -> Block:
     return Block(block.t, block.channels, values)
 
 
+def encoder_zero(by: float) -> Samples:
+    """Every encoder has a zero of so much, rad."""
+
+    def distort(system: System, block: Block, random: np.random.Generator) -> dict[Key, float]:
+        out: dict[Key, float] = {}
+        for k in _columns(block, "q_", "theta_m"):
+            zero = out["encoder_zero", block.channels[k], ""] = by * _sign(random)
+            block.values[:, k] += zero
+        return out
+
+    return distort
+
+
+@cache
+def _described(friction: bool) -> System:
+    """The planar example, its joints with declared friction or without."""
+    system = load_system(SYSTEM)
+    return declaring(system, [parse_effect(effect, system) for effect in FRICTION if friction])
+
+
 def _geometry(system: System, length: float, axis: float) -> System:
     first, *others = system.links
     joint = system.joints[1]
@@ -153,46 +181,56 @@ def _geometry(system: System, length: float, axis: float) -> System:
     return system.model_copy(update={"links": (longer, *others), "joints": joints})
 
 
-# Kind to how much longer link 1 is, by how much joint 2 is turned, and what befalls the samples.
-KINDS: dict[str, tuple[float, float, tuple[Samples, ...]]] = {
-    "clean": (0.0, 0.0, ()),
-    "tracked point 0.2 mm": (0.0, 0.0, (tracked_point(2e-4),)),
-    "tracked point 1 mm": (0.0, 0.0, (tracked_point(1e-3),)),
-    "tracked point 5 mm": (0.0, 0.0, (tracked_point(5e-3),)),
-    "length 0.12 mm": (LENGTH, 0.0, ()),
-    "axis 0.5 mrad": (0.0, AXIS, ()),
-    "camera 50 us": (0.0, 0.0, (clock(5e-5),)),
-    "camera 0.5 ms": (0.0, 0.0, (clock(5e-4),)),
-    "camera 4 ms": (0.0, 0.0, (clock(4e-3),)),
-    "once per turn 2e-5": (0.0, 0.0, (once_per_turn(2e-5),)),
-    "once per turn 1e-4": (0.0, 0.0, (once_per_turn(1e-4),)),
-    "marker zero 1e-4": (0.0, 0.0, (marker_zero(1e-4),)),
-    "torque gain 0.1 %": (0.0, 0.0, (torque_gain(1e-3),)),
-    "all": (
-        LENGTH,
-        AXIS,
-        (tracked_point(2e-4), clock(5e-5), once_per_turn(2e-5), marker_zero(1e-4), torque_gain(1e-3)),
-    ),
-    "stamps 0.1 ms": (0.0, 0.0, (stamps(1e-4),)),
-    "stamps 0.5 ms": (0.0, 0.0, (stamps(5e-4),)),
-    "markers 5 ms": (0.0, 0.0, ()),
-    "markers 50 ms": (0.0, 0.0, ()),
+@dataclass(frozen=True)
+class Kind:
+    """What befalls the samples, how much longer link 1 is, m, by how much joint 2 is turned, rad; and friction."""
+
+    samples: tuple[Samples, ...] = ()
+    length: float = 0.0
+    axis: float = 0.0
+    friction: bool = False
+
+
+ALL = (tracked_point(2e-4), clock(5e-5), once_per_turn(2e-5), marker_zero(1e-4), torque_gain(1e-3))
+KINDS: dict[str, Kind] = {
+    "clean": Kind(),
+    "tracked point 0.2 mm": Kind((tracked_point(2e-4),)),
+    "tracked point 1 mm": Kind((tracked_point(1e-3),)),
+    "tracked point 5 mm": Kind((tracked_point(5e-3),)),
+    "length 0.12 mm": Kind(length=LENGTH),
+    "axis 0.5 mrad": Kind(axis=AXIS),
+    "camera 50 us": Kind((clock(5e-5),)),
+    "camera 0.5 ms": Kind((clock(5e-4),)),
+    "camera 4 ms": Kind((clock(4e-3),)),
+    "once per turn 2e-5": Kind((once_per_turn(2e-5),)),
+    "once per turn 1e-4": Kind((once_per_turn(1e-4),)),
+    "marker zero 1e-4": Kind((marker_zero(1e-4),)),
+    "torque gain 0.1 %": Kind((torque_gain(1e-3),)),
+    "all": Kind(ALL, LENGTH, AXIS),
+    "stamps 0.1 ms": Kind((stamps(1e-4),)),
+    "stamps 0.5 ms": Kind((stamps(5e-4),)),
+    "markers 5 ms": Kind(),
+    "markers 50 ms": Kind(),
+    "friction": Kind(friction=True),
+    "friction, encoders": Kind((once_per_turn(2e-5), encoder_zero(1e-4)), friction=True),
+    "friction, all": Kind((*ALL, encoder_zero(1e-4)), LENGTH, AXIS, friction=True),
 }
 # Correlation time, s, of the markers' noise where it is not white.
 COLOURS = {"markers 5 ms": 5e-3, "markers 50 ms": 5e-2}
 
 
 @cache
-def _exact(folder: Path, length: float, axis: float) -> Block:
-    system = _geometry(load_system(SYSTEM), length, axis)
-    return exact_session(system, folder / f"{SYSTEM}-{length:g}-{axis:g}.npz")
+def _exact(folder: Path, length: float, axis: float, friction: bool) -> Block:
+    system = _geometry(_described(friction), length, axis)
+    rubbing = "-friction" if friction else ""
+    return exact_session(system, folder / f"{SYSTEM}{rubbing}-{length:g}-{axis:g}.npz")
 
 
 def run(args: argparse.Namespace) -> None:
     """Append the sessions that the results lack, seed by seed."""
     folder = args.results.parent
     for kind in args.kinds:
-        _exact(folder, *KINDS[kind][:2])
+        _exact(folder, KINDS[kind].length, KINDS[kind].axis, KINDS[kind].friction)
     wanted = product(range(args.seeds), args.kinds, args.tolerances)
     tasks = [({"kind": k, "tolerances": t, "seed": seed}, (folder, k, t, seed)) for seed, k, t in wanted]
     complete(args, one_session, tasks)
@@ -200,13 +238,13 @@ def run(args: argparse.Namespace) -> None:
 
 def one_session(folder: Path, kind: str, tolerances: str, seed: int) -> Record:
     """Estimate, its deviations and judgement."""
-    described = load_system(SYSTEM)
-    length, axis, distortions = KINDS[kind]
-    exact = _exact(folder, length, axis)
+    own = KINDS[kind]
+    described = _described(own.friction)
+    exact = _exact(folder, own.length, own.axis, own.friction)
     block = Block(exact.t, exact.channels, exact.values.copy())
     random = np.random.default_rng(seed)
     true: dict[Key, float] = {}
-    for distort in distortions:
+    for distort in own.samples:
         true |= distort(described, block, random)
     without, block = block, noisy_session(described, block, GRADE, seed)
     if kind in COLOURS:
@@ -237,15 +275,15 @@ def summary(records: list[Record]) -> str:
 
     said: share of what is wrong that is reported with its size; within: that is within three of its deviations.
     """
-    truth = true_parameters(load_system(SYSTEM))
-    clean = _stds(records, "clean", "none")
     names = ("sessions", "cover", "rms z", "worst z", "bars", "green", "said", "within", "s")
     lines = [f"{'kind':24}{'tolerances':>12}" + "".join(f"{name:>9}" for name in names)]
     for kind in KINDS:
         for tolerances in TOLERANCES:
             own = [r for r in records if (r["kind"], r["tolerances"]) == (kind, tolerances)]
             if own:
-                lines.append(_line(kind, tolerances, own, truth, clean))
+                friction = KINDS[kind].friction
+                clean = _stds(records, "friction" if friction else "clean", "none")
+                lines.append(_line(kind, tolerances, own, true_parameters(_described(friction)), clean))
     return "\n".join(lines)
 
 
