@@ -88,6 +88,7 @@ class Lags:
     def __init__(self, rows: Estimator | SessionRows, segments: Sequence[Segment]) -> None:
         self._rows, self._segments = rows, list(segments)
         self._independent = 0
+        self._left: dict[tuple[str | None, float], Array] = {}
 
     def places(self) -> dict[str, list[str]]:
         """Groups of sensors that may be late together, and sensors of no group; to each the parts of a group."""
@@ -110,6 +111,11 @@ class Lags:
 
         Without a lag unless where is given. Infinite where readings are of no shape of the links.
         """
+        if (where, corner) not in self._left:
+            self._left[where, corner] = self._predicted(where, corner)
+        return self._left[where, corner]
+
+    def _predicted(self, where: str | None, corner: float) -> Array:
         segments = self._segments
         if where is not None:
             # The samples are free of what is declared, latencies of sensors included.
@@ -145,7 +151,9 @@ def find_late(rows: SessionRows, without: Sequence[str] = ()) -> LateSensor | No
     least = HELD / rows.model.system.sample_rate
     corners = [corner for corner in CORNERS if delay_of(corner) > least]
     limit = threshold(FALSE_ALARM, len(places) * len(corners), 1)
-    near = _near_best(rows, list(places), corners, limit)
+    some = stretches(rows, rows.segments)
+    part = sum(each.index.size for each in some) < sum(each.index.size for each in rows.segments)
+    near = _near_best(Lags(rows, some) if part else lags, list(places), corners, limit)
     tried = [(lags.left(where, corner), where, corner) for where, corner in near]
     # A lag that is none leaves some types of rows with less and others with more.
     tried = [each for each in tried if lags.gains(before, each[0]).min() > -limit]
@@ -171,21 +179,14 @@ def find_late(rows: SessionRows, without: Sequence[str] = ()) -> LateSensor | No
     return LateSensor(lag(where, corner), std, float(gain), limit, *shares, tuple(late_keys((), alike)))
 
 
-def _near_best(
-    rows: SessionRows, places: Sequence[str], corners: Sequence[float], limit: float
-) -> list[tuple[str, float]]:
-    """Lags (place, corner) that gain nearly as much as the best does, by part of a session where that is longer.
+def _near_best(lags: Lags, places: Sequence[str], corners: Sequence[float], limit: float) -> list[tuple[str, float]]:
+    """Lags (place, corner) that gain nearly as much as the best does.
 
     limit: what gains by accident, or loses. Where a short lag loses more, a longer one of that place does too.
     """
-    every = [(where, corner) for where in places for corner in corners]
-    some = stretches(rows, rows.segments)
-    if sum(part.index.size for part in some) == sum(part.index.size for part in rows.segments):
-        return every
-    lags = Lags(rows, some)
     before = lags.left()
     if not np.all(np.isfinite(before)):
-        return every
+        return [(where, corner) for where in places for corner in corners]
     gains: dict[tuple[str, float], float] = {}
     for where in places:
         for corner in sorted(corners, key=delay_of):

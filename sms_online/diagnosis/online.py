@@ -19,7 +19,7 @@ from sms_online.diagnosis.searcher import Outcome, Request, Searcher
 from sms_online.model.model import Model
 from sms_online.pipeline.changes import ModelUpdate
 from sms_online.pipeline.estimator import Estimator
-from sms_online.pipeline.events import Event
+from sms_online.pipeline.events import TRANSIENT, Event
 from sms_online.pipeline.momentum import Momentum
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.synchronise import GridSamples
@@ -117,8 +117,8 @@ class OnlineDiagnosis(RunningDiagnosis):
             if self._onset is None:
                 evidence = self._momentum.test.evidence
                 self.episodes.append(Episode(self._now, max(evidence, key=lambda row: evidence[row]), event.time))
-            episode = self.episodes[-1]
-            episode.verdict, episode.named, episode.event, episode.named_at = "change", (), event, self._now
+            episode, said = self.episodes[-1], "passed" if event.kind == TRANSIENT else "change"
+            episode.verdict, episode.named, episode.event, episode.named_at = said, (), event, self._now
             self._close()
             self.on_verdict(self._now, line(episode))
             index = round((event.time - self._estimator.start_time) * self._estimator.system.sample_rate)

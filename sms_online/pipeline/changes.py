@@ -23,7 +23,7 @@ from sms_online.pipeline.event_hypotheses import (
 )
 from sms_online.pipeline.event_instant import event_instant
 from sms_online.pipeline.event_rows import CLOCK, LARGEST_SHIFT, AfterChange, EventRows
-from sms_online.pipeline.events import REMEMBERED, ChangeDetector, ClockShift, Event, Seen, prior_behind
+from sms_online.pipeline.events import REMEMBERED, TRANSIENT, ChangeDetector, ClockShift, Event, Seen, prior_behind
 from sms_online.pipeline.latency import wandering_clocks
 from sms_online.pipeline.momentum_balance import MARGIN
 from sms_online.pipeline.momentum_windows import INSTANTS
@@ -216,7 +216,8 @@ class Changes(Stage):
         samples = self.behind(alarm)
         behind = self._rows.explain(whole, base, before, samples, (onset, alarm), noise)
         explanation = behind.explanation
-        clear = explanation.explained and explanation.decisive and not (steps and behind.goes_on)
+        clear = explanation.explained and explanation.decisive and explanation.changed
+        clear = clear and not (steps and behind.goes_on)
         if not clear and (steps or (not last and self.windows_after < LONGEST_DECISION)):
             self.state.wanted = self.windows_after + DECISION
             return behind
@@ -224,6 +225,13 @@ class Changes(Stage):
         if self.detector.uncertain and not (explanation.jump and explanation.explained and explanation.needed):
             self.detector.dismiss()
             return None
+        late = max(alarm, int(self.state.index[-1]) - self.window_samples - 2 * MARGIN - 2 * DECISION * self._half_hop)
+        if not explanation.explained and late > alarm:
+            # What acts may have ended meanwhile.
+            at_last = self._rows.explain(whole, base, before, self.behind(late), (onset, alarm), noise).explanation
+            explanation, alarm = (explanation, alarm) if at_last.changed else (at_last, late)
+        if not explanation.changed:
+            return self._unchanged(TRANSIENT, alarm, start_time)
         if explanation.jump is not None and explanation.jump.kind == CLOCK:
             return self._follow_clocks(explanation, onset, alarm, start_time)
         return self._adopt(whole, base, explanation, onset, alarm, start_time)
@@ -240,14 +248,22 @@ class Changes(Stage):
         if self.detector.uncertain:
             self.detector.dismiss()
             return None
-        onset = self.detector.onset - MARGIN
-        before = self.detector.before(onset)
-        time = start_time + 0.5 * (onset + self.detector.alarm) / self._system.sample_rate
-        dropped = sum(seen.end > before.end for seen in self.detector.history)
-        self.state.events.append(Event(time, "undecided", (), (), (), (), dropped))
-        known = self._known_at(before, int(self.state.index[-1]))
-        nothing = GridSamples(self.state.index[:0], self.state.values[:0], self.state.segment)
-        return Adoption(self.model, self.base, known, self.parameters(known), before.misfit, nothing)
+        return self._unchanged("undecided", int(self.state.index[-1]) + 1, start_time)
+
+    def _unchanged(self, kind: str, until: int, start_time: float) -> Adoption:
+        """Go on with what was known before an alarm, and with samples from a grid index on."""
+        onset, alarm = self.detector.onset - MARGIN, self.detector.alarm
+        assert alarm is not None
+        before, samples = self._before(onset), self.behind(until)
+        time = start_time + 0.5 * (onset + alarm) / self._system.sample_rate
+        reach = until + self.window_samples
+        dropped = sum(before.end < seen.end <= reach for seen in self.detector.history)
+        self.state.events.append(Event(time, kind, (), (), (), (), dropped))
+        known = self._known_at(before, until)
+        if samples.index.size:
+            self.detector = self._new_detector()
+            self.detector.begin(known)
+        return Adoption(self.model, self.base, known, self.parameters(known), before.misfit, samples)
 
     def _known_at(self, before: Seen, index: int) -> Information:
         """What was known before a change, of the parameters as they would be at a grid index: drifts go on."""

@@ -66,7 +66,8 @@ class Explanation:
 
     jump: None where the rows determine no hypothesis. sizes, stds: of each jump (p,). beta (n,): the parameters
     as they were before, from all rows. explained: whether it leaves little but noise. decisive: whether the next best
-    leaves clearly more. needed: whether more than noise is left without it.
+    leaves clearly more. needed: whether more than noise is left without it; pays: whether it takes as much as a jump
+    costs.
     """
 
     jump: Jump | None
@@ -76,6 +77,12 @@ class Explanation:
     explained: bool
     decisive: bool
     needed: bool
+    pays: bool
+
+    @property
+    def changed(self) -> bool:
+        """Whether the rows show that anything has changed."""
+        return self.needed or self.pays
 
 
 def everything(system: System) -> System:
@@ -184,7 +191,7 @@ def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -
     cost = alike * COST_OF_A_JUMP + LEAST_SHARE * float(residual @ residual)
     ranked.sort(key=lambda entry: round((entry[0] + cost * len(entry[1].columns)) / SAME))
     if not ranked:
-        return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True, True)
+        return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True, True, False)
     rss, best = ranked[0]
     others = [other - rss for other, jump in ranked[1:] if len(jump.columns) == len(best.columns)]
     decisive = all(more > alike * DECISIVE or more < SAME for more in others)
@@ -194,8 +201,9 @@ def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -
     freedom = M - len(columns)
     beyond_noise = max(rss - freedom, 0.0) / max(float(residual @ residual) - M, 1.0)
     explained = rss <= _most_of_noise(freedom) or beyond_noise <= UNEXPLAINED
-    needed = float(residual @ residual) > _most_of_noise(M)
-    return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive, needed)
+    without = float(residual @ residual)
+    needed, pays = without > _most_of_noise(M), without - rss > cost * len(columns)
+    return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive, needed, pays)
 
 
 def goes_on(factor: Array, rows: Array, ramps: Array, explanation: Explanation, alike: float = 1.0) -> float:

@@ -46,6 +46,9 @@ SLACK = 1.0
 # large alarms again.
 LARGEST_LEVEL = 1.3
 
+# Kind of an event behind which nothing has changed.
+TRANSIENT = "transient"
+
 
 @dataclass(frozen=True)
 class Event:
@@ -53,7 +56,8 @@ class Event:
 
     time: s. kind: `payload`, `stiffness`, `damping`, `friction`, `offset` or `inertia`; `unexplained` where no jump
     explains what followed, so that the estimate began anew; `undecided` where the session ended too early to decide, so
-    that the estimate is that of before; `effect` where one was added to the model. parameters: the names of
+    that the estimate is that of before; `transient` where what acted has ended, and no parameter has changed; `effect`
+    where one was added to the model. parameters: the names of
     what jumped, with unit, size and std (1σ) of each jump in that unit. dropped_windows: windows of rows, or spans of a
     smoother, that reach across the event or may, and were left out.
     """

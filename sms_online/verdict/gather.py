@@ -10,7 +10,7 @@ import numpy as np
 from sms_online.description.sources import source_channels
 from sms_online.evaluation import Evaluation
 from sms_online.pipeline.event_hypotheses import PAYLOAD
-from sms_online.pipeline.events import Event
+from sms_online.pipeline.events import TRANSIENT, Event
 from sms_online.pipeline.periods import LONGEST_HOLE
 from sms_online.pipeline.sensing import is_slow
 from sms_online.pipeline.statistics import Statistics
@@ -73,7 +73,7 @@ def evidence_of(evaluation: Evaluation, discrepancies: Sequence[Discrepancy], tr
 
 def repeated(events: Sequence[Event]) -> tuple[str, ...]:
     """Names of the parameters that have jumped the same way in each of the last changes; not payloads, which add up."""
-    series = [event for event in events[-SERIES:] if event.kind != PAYLOAD]
+    series = [event for event in events[-SERIES:] if event.kind not in (PAYLOAD, TRANSIENT)]
     if len(series) < SERIES:
         return ()
     ways = {(event.parameters, tuple(size > 0.0 for size in event.sizes)) for event in series}
