@@ -85,6 +85,14 @@ def swap(one: str, other: str) -> Change:
     return change
 
 
+def swap_joints(*kinds: str) -> Change:
+    def change(values: dict[str, Array]) -> None:
+        for kind in kinds:
+            swap(f"{kind}_1", f"{kind}_2")(values)
+
+    return change
+
+
 def test_a_session_without_a_mistake_has_none() -> None:
     assert found(lambda values: None).mistakes == ()
 
@@ -104,6 +112,15 @@ def test_a_session_without_a_mistake_has_none() -> None:
         pytest.param(times(2.0, "q_2"), "counts@q_2", "reads twice the angle", marks=pytest.mark.long),
         pytest.param(times(50.0, "theta_m_1"), "motor_angle@theta_m_1", "before the gear", marks=pytest.mark.long),
         pytest.param(swap("tau_1", "tau_2"), "swapped@tau_1, tau_2", "are swapped", marks=pytest.mark.long),
+        pytest.param(
+            swap_joints("q", "theta_m"),
+            "swapped@q_1, theta_m_1, q_2, theta_m_2",
+            "the encoders of",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            swap_joints("tau", "q", "theta_m"), "swapped@joint_1, joint_2", "all channels of", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_mistake_is_named_and_nothing_else(change: Change, key: str, words: str) -> None:

@@ -243,6 +243,24 @@ def _swaps(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     for one, other in pairs:
         where, both = f"{_common(one)}, {_common(other)}", f"{_common(one)} and {_common(other)}"
         yield MistakeHypothesis("swapped", where, f"{both} are swapped", f"swap {both}", _swapped(one, other))
+    yield from _swapped_axes(channels)
+
+
+def _swapped_axes(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
+    """Joints whose encoders are swapped, where each has two, and joints of which all is."""
+    joints = grouped((name.rpartition("_")[2], name) for name in channels if name.startswith(("q_", "theta_m_")))
+    drives = {name.rpartition("_")[2]: name for name in channels if _is_drive(name)}
+    for (i, first), (j, second) in combinations(joints.items(), 2):
+        if len(first) != len(second):
+            continue
+        if len(first) == 2:
+            said = f"the encoders of joint_{i} and joint_{j} are swapped"
+            where = ", ".join((*first, *second))
+            yield MistakeHypothesis("swapped", where, said, "swap both encoders", _swapped(first, second))
+        if i in drives and j in drives:
+            said, where = f"all channels of joint_{i} and joint_{j} are swapped", f"joint_{i}, joint_{j}"
+            one, other = [drives[i], *first], [drives[j], *second]
+            yield MistakeHypothesis("swapped", where, said, "check the order of the axes", _swapped(one, other))
 
 
 def _common(names: Sequence[str]) -> str:
