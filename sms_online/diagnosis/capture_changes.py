@@ -120,7 +120,8 @@ def diagnosed_part(run: Sequence[Block], event: Event, apart: float) -> tuple[li
 
 def _off_centre(jumps: Sequence[_Jump], added: Sequence[_Jump]) -> Iterator[_Jump]:
     """A payload whose centre of mass is not in the tip: a mass there, and all that the last link shows of a body."""
-    links = [each for each in jumps if len(each[0]) == 1 and each[0][0].name.startswith("link_")]
+    single = [each for each in jumps if len(each[0]) == 1 and "@" not in each[0][0].name]
+    links = [each for each in single if each[0][0].name.startswith("link_")]
     if not links:
         return
     last = max(_link(each) for each in links)

@@ -116,7 +116,8 @@ def diagnose(
     if drifts:
         return _drifting(case, followed, drifts, mistakes, zeros)
     late: list[LateSensor] = []
-    while (_explains_little(before) or attempt.tracing.exceeds) and (found := find_late(attempt.rows, reconstructed)):
+    little = _explains_little(before)
+    while (little or _may_be_late(attempt)) and (found := find_late(attempt.rows, reconstructed)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         attempt = Attempt(case, declaring(attempt.system, [found.effect]))
@@ -343,6 +344,12 @@ def _noise(session: Estimator, source: str) -> SensorNoise:
 def _beyond(attempt: Attempt, chosen: Sequence[int]) -> bool:
     """Whether rows leave more than noise with the effects chosen."""
     return any(row.beyond for row in attempt.test(chosen).values())
+
+
+def _may_be_late(attempt: Attempt) -> bool:
+    """Whether rows leave more than noise whatever is added; where all hold a torque, whether they leave more at all."""
+    with_torque = np.any(attempt.rows.b, axis=0)
+    return attempt.tracing.exceeds or (bool(with_torque.all()) and _beyond(attempt, ()))
 
 
 def _explains_little(estimator: Estimator) -> bool:

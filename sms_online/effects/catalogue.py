@@ -292,8 +292,9 @@ def in_words(effect: Effect, system: System, coefficients: Mapping[str, float]) 
     return f"{words} against {other}'s: the data cannot decide which is right" if other else words
 
 
-# Channels that come together, beside those of a link's markers.
+# Channels that come together, beside those of a link's markers; and those that one controller may read late.
 DEVICES = ("r_S_*", "eps_*")
+ENCODERS = ("q_*", "theta_m_*")
 
 
 def _groups(system: System, entry: Entry) -> Iterable[str]:
@@ -317,6 +318,7 @@ def _groups(system: System, entry: Entry) -> Iterable[str]:
     links = [f"{c.split('.')[0]}.*" if "." in c and c not in gauges else c for c in devices]
     patterns = [pattern for sensor in system.sensors for pattern in sensor.channels]
     shared = [p for p in patterns if any(fnmatchcase(c, p) for c in positions)]
+    shared += [p for p in ENCODERS if sum(fnmatchcase(c, p) for c in positions) > 1]
     # Encoders behind springs, where others sit on motors: they come from other electronics.
     second = [c.removeprefix("q_") for c in positions if c.startswith("q_") and f"theta_m_{c[2:]}" in positions]
     if 1 < len(second) < len(joints := [c for c in positions if c.startswith("q_")]) and len(joints) < TEN:

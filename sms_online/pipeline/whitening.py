@@ -8,7 +8,8 @@ it keeps those that the next one overlaps; the same rows of L whiten any further
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import msgspec
 import numpy as np
@@ -18,8 +19,9 @@ from scipy.linalg.lapack import dtbtrs, dtrtrs
 from sms_online.state import Stage, State
 from sms_online.stream import Array
 
-# Share of a row's variance that is added to it alone, for the rounding of the factorisation.
-ROUNDING = 1e-13
+# Shares of a row's variance that are added to it alone: for the rounding of the factorisation, and more where that is
+# too little, as what dry friction makes of noise is a covariance but for the quadrature of its parts.
+ROUNDING = (1e-13, 1e-10, 1e-8, 1e-6)
 
 
 class Factor(State):
@@ -34,18 +36,28 @@ class Factor(State):
         (n_v,): further variance of each row, of its own. Raises numpy.linalg.LinAlgError where the covariance is not
         positive definite.
         """
-        own = covariances[-1].copy()
-        n_v = len(own)
-        diagonal = np.einsum("ii->i", own)
-        diagonal += ROUNDING * diagonal + errors
+        own = covariances[-1]
+        n_v, variance = len(own), np.diag(own)
         size = n_v * (len(covariances) - 1)
         L = self.L[len(self.L) - size :, len(self.L) - size :]
         cross = np.concatenate([np.empty((n_v, 0)), *covariances[:-1]], axis=1).T  # (size, n_v)
         X = forward_solved(L, cross) if size else cross
+
+        def factor(share: float) -> Array:
+            return np.linalg.cholesky(own + np.diag(share * variance + errors) - X.T @ X)
+
         self.L = np.zeros((size + n_v, size + n_v))
         self.L[:size, :size] = L
-        self.L[size:, :size], self.L[size:, size:] = X.T, np.linalg.cholesky(own - X.T @ X)
+        self.L[size:, :size], self.L[size:, size:] = X.T, _positive(factor)
         return self.L[size:]
+
+
+def _positive(factor: Callable[[float], Array]) -> Array:
+    """What `factor` gives of the least share of its variance that makes a matrix positive definite; LinAlgError."""
+    for share in ROUNDING[:-1]:
+        with suppress(np.linalg.LinAlgError):
+            return factor(share)
+    return factor(ROUNDING[-1])
 
 
 def forward_solved(L: Array, right: Array) -> Array:
@@ -95,17 +107,21 @@ class Whitening:
         """covariances, errors (W, n_v): of each window as `Factor` takes them; LinAlgError as it raises it."""
         W, n_v = errors.shape
         reach = max((len(some) for some in covariances), default=0)
-        # Lower band: entry (i, j) is at (i - j, j).
-        band = np.zeros((max(1, reach * n_v), W * n_v))
         row, column = np.indices((n_v, n_v))
-        for hops in range(reach):
-            later = np.array([k for k, some in enumerate(covariances) if len(some) > hops])
-            blocks = np.array([covariances[k][-1 - hops] for k in later.tolist()])
-            below = hops * n_v + row - column
-            own = below >= 0
-            band[below[own], (later - hops)[:, None] * n_v + column[own]] = blocks[:, own]
-        band[0] += ROUNDING * band[0] + errors.ravel()
-        self._factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if W else band
+
+        def factor(share: float) -> Array:
+            # Lower band: entry (i, j) is at (i - j, j).
+            band = np.zeros((max(1, reach * n_v), W * n_v))
+            for hops in range(reach):
+                later = np.array([k for k, some in enumerate(covariances) if len(some) > hops])
+                blocks = np.array([covariances[k][-1 - hops] for k in later.tolist()])
+                below = hops * n_v + row - column
+                own = below >= 0
+                band[below[own], (later - hops)[:, None] * n_v + column[own]] = blocks[:, own]
+            band[0] += share * band[0] + errors.ravel()
+            return cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False) if W else band
+
+        self._factor = _positive(factor)
         self.std: Array = self._factor[0].reshape(W, n_v)
 
     def of(self, columns: Array) -> Array:
