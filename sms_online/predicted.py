@@ -66,7 +66,7 @@ class PredictedTorque(Predicted):
 
     zero: what its channel reads too much throughout if the prediction is right, in `unit`; zero_share: its size over
     rms of the torque. turned: what deflections of its spring would be read too large by in its place, rad (m), 0
-    without a spring; tolerance: of an encoder's zero.
+    without a spring; tolerance: of an encoder's zero. at_rest: share of the run that is left out, see `TorqueCourse`.
     """
 
     channel: str = ""
@@ -75,6 +75,7 @@ class PredictedTorque(Predicted):
     zero_share: float = 0.0
     turned: float = 0.0
     tolerance: float = 0.0
+    at_rest: float = 0.0
 
     @property
     def holds(self) -> bool:
@@ -105,4 +106,5 @@ class PredictedTorque(Predicted):
             "zero": self.zero,
             "beside_zero": self.beside_zero,
             "turned": self.turned,
+            "at_rest": self.at_rest,
         }

@@ -17,6 +17,10 @@ from sms_online.pipeline.observer import Observer
 from sms_online.row_types import joint_rows
 from sms_online.stream import Array, Indices
 
+# A joint with dry friction is at rest where it is slower than this share of its fastest so far: friction takes any
+# value up to breakaway there, which no parameters predict.
+AT_REST = 0.01
+
 
 @dataclass(frozen=True)
 class TorqueCourse:
@@ -24,7 +28,7 @@ class TorqueCourse:
 
     t (W,): middle of each window, s. measured (W,), predicted (W,): mean over it, weighted by its test function, in
     `unit`. soft: by how much a deflection of its spring would have to be read too large, rad (m), for one `unit` of
-    torque; 0 where the joint has none.
+    torque; 0 where the joint has none. at_rest: share of the run's windows that are left out, see `AT_REST`.
     """
 
     channel: str
@@ -33,6 +37,7 @@ class TorqueCourse:
     measured: Array
     predicted: Array
     soft: float = 0.0
+    at_rest: float = 0.0
 
     @property
     def left(self) -> float:
@@ -75,6 +80,11 @@ class TorquePrediction(Observer):
         self._drives = {
             i: (channel, self._balance.weight * ratio) for i, (channel, ratio) in session.sensing.drives.items()
         }
+        layout, effects = session.model.layout, session.model.effects
+        dry = {each.axis(layout) for each in effects if each.dry}
+        self._rubbing = {i for i in self._drives if layout.theta_m[i] in dry}
+        self._fastest = np.zeros(len(layout.theta_m))
+        self._at_rest = dict.fromkeys(self._drives, 0)
         self._segment = -1
         self._windows: dict[int, list[tuple[float, float, float]]] = {i: [] for i in self._drives}
         # Sums over windows of the products of [Y r 1], joint by joint.
@@ -85,10 +95,13 @@ class TorquePrediction(Observer):
         if segment != self._segment:
             self._segment = segment
             self._balance.begin_segment()
-        for start, rows, measured in self._balance.windows(x, v, np.concatenate((inputs, states), axis=1)):
+        for start, rows, measured, speed in self._balance.windows(x, v, np.concatenate((inputs, states), axis=1)):
             middle = (index[0] + start + self._balance.width // 2) / self._rate
+            self._fastest = np.fmax(self._fastest, speed)
             for i, (_, unit) in self._drives.items():
-                if np.isfinite(rows[i]).all():
+                if i in self._rubbing and speed[i] < AT_REST * self._fastest[i]:
+                    self._at_rest[i] += 1
+                elif np.isfinite(rows[i]).all():
                     error = float(rows[i] @ self._unknowns[i])
                     self._windows[i].append((middle, measured[i] / unit, (measured[i] + error) / unit))
                     columns = np.concatenate((rows[i][self._free], [error, 1.0]))
@@ -104,7 +117,10 @@ class TorquePrediction(Observer):
                 if measured.any():
                     channel, _ = self._drives[i]
                     unit = channel_unit(system, channel)
-                    out[joint_rows(i)] = TorqueCourse(channel, unit, start + t, measured, predicted, self._soft[i])
+                    rest = self._at_rest[i] / (self._at_rest[i] + len(windows))
+                    out[joint_rows(i)] = TorqueCourse(
+                        channel, unit, start + t, measured, predicted, self._soft[i], rest
+                    )
         return out
 
     def least(self, courses: Mapping[str, TorqueCourse]) -> dict[str, float]:

@@ -41,6 +41,8 @@ from sms_online.verdict.reasons import (
 
 SCHEMA = "sms-online/validation/1"
 AS_WELL = "The parameters predict this run as well as those fitted to it"
+# Share of a run in which a joint is at rest that is worth a word.
+RESTING = 0.01
 # What validation says of parameters: they hold; a torque is mostly noise, and contradicts nothing; they do as well as a
 # fit to the run, which leaves a large share of a torque unexplained; they hold but for the zero of a torque; they
 # differ from those of the run; nothing has them.
@@ -227,10 +229,11 @@ def validate(
             each.zero_share,
             each.turned,
             system.tolerances.encoder_zero,
+            each.at_rest,
         )
         for name, each in courses.items()
     }
-    warnings = (*recorded.source.warnings, *beyond(session.model, motion.motions))
+    warnings = (*recorded.source.warnings, *_resting(courses), *beyond(session.model, motion.motions))
     cannot = _impossible(session.model, session.base, beta, parameters)
     return Validation(
         system.name,
@@ -251,6 +254,13 @@ def beyond(model: Model, motions: Sequence[Motion]) -> list[str]:
         return []
     x, v = (np.concatenate([getattr(motion, part) for motion in motions]) for part in ("x", "v"))
     return [said for effect in model.effects if (said := effect.beyond(model.layout, x, v))]
+
+
+def _resting(courses: Mapping[str, TorqueCourse]) -> list[str]:
+    """What of a run is not predicted for joints with dry friction that are at rest, a sentence."""
+    shares = [f"{name} {100.0 * each.at_rest:.0f} %" for name, each in courses.items() if each.at_rest >= RESTING]
+    why = "dry friction is any force up to breakaway there"
+    return [f"left out where a joint is at rest, for {why}: {', '.join(shares)}"] if shares else []
 
 
 def _values(base: BaseParameters, system: System, parameters: Parameters | Mapping[str, float] | None) -> Array:

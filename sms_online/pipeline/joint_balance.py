@@ -111,6 +111,7 @@ class JointBalance(Stage):
         self._phi, self._phi_dot = phi / sample_rate, phi_dot / sample_rate
         layout, n = model.layout, base.n
         columns = layout.n_x + layout.n_v + model.n_signals
+        self._speeds = [layout.n_x + theta_m for theta_m in layout.theta_m]
         numbers: tuple[list[int], list[int]] = ([], [])
         if self._calibration is not None:
             numbers = self._calibration.positions, self._calibration.torques
@@ -132,22 +133,23 @@ class JointBalance(Stage):
 
         signals (B, n_signals): see `Model.inputs`.
         """
-        for _, rows, measured in self.windows(x, v, signals):
+        for _, rows, measured, _ in self.windows(x, v, signals):
             for residual, row, signal in zip(self.state.residuals, rows, measured, strict=True):
                 if np.isfinite(row).all():
                     residual.add(row, signal)
 
-    def windows(self, x: Array, v: Array, signals: Array) -> Iterator[tuple[int, Array, Array]]:
-        """Each window that further samples complete: its first sample, rows and measured torques or forces.
+    def windows(self, x: Array, v: Array, signals: Array) -> Iterator[tuple[int, Array, Array, Array]]:
+        """Each window that further samples complete: its first sample, rows, measured torques or forces, and speeds.
 
         The sample is counted from the first of these, negative where it came before. rows (joints, ·): [Y D T b], see
-        `SquaredResidual`. measured (joints,): N m s (N s).
+        `SquaredResidual`. measured (joints,): N m s (N s). speeds (joints,): largest of each motor, rad/s (m/s).
         """
         held = self.state.samples.shape[0]
         samples = np.concatenate((self.state.samples, np.concatenate((x, v, signals), axis=1)))
         start = self.state.skip
         while start + self.width + 1 <= samples.shape[0]:
-            yield start - held, *self._window(samples[start : start + self.width + 1])
+            window = samples[start : start + self.width + 1]
+            yield start - held, *self._window(window), np.abs(window[:, self._speeds]).max(axis=0)
             start += self.hop
         dropped = min(start, samples.shape[0])
         self.state.samples, self.state.skip = samples[dropped:], start - dropped
