@@ -224,12 +224,28 @@ def test_a_camera_later_than_its_tolerance_is_not_trusted(exact: Block) -> None:
             4e-5,
             "joint_2: gain of the torque (against joint_1) 0.1000 ± 0.0040 % off",
         ),
+        (
+            "gauge_low_pass",
+            "gauges",
+            "",
+            "s²",
+            -2.94e-5,
+            6.3e-6,
+            "gauges lead what bends them: low-pass -29.4 ± 6.3 ms² off",
+        ),
     ],
 )
 def test_calibration_is_said_in_units_of_the_workshop(
     name: str, where: str, part: str, unit: str, estimate: float, std: float, sentence: str
 ) -> None:
     assert str(Calibration(name, where, part, unit, estimate, std, None)) == sentence
+
+
+def test_what_no_sensor_does_is_not_to_be_tolerated() -> None:
+    leading = Calibration("gauge_low_pass", "gauges", "", "s²", -3e-5, 1e-6, 2.5e-6)
+    wide, usual = (Calibration("once_per_turn", "q_1", "sine", "rad", by, 1e-5, 5e-5) for by in (3e-3, 3e-4))
+    assert not any("larger tolerances" in each.advice for each in (leading, wide))
+    assert "larger tolerances" in usual.advice
 
 
 def test_tolerances_none_says_that_all_is_exact() -> None:

@@ -44,6 +44,9 @@ SCALES = {
     "": (("%", 1e-2),),
 }
 
+# An error once per turn of so many tolerances is rarely the encoder's.
+RARE = 20.0
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -77,6 +80,10 @@ class Calibration:
         if self.name == "gauge_low_pass" and self.estimate > 0.0:
             corner = 1.0 / (2.0 * np.pi * np.sqrt(self.estimate))
             return f"{self.where} behind a low-pass of {_rounded(corner, 0.5 * corner * self.std / self.estimate)} Hz"
+        if self.name == "gauge_low_pass":
+            return (
+                f"{self.where} lead what bends them: low-pass {_rounded(1e6 * self.estimate, 1e6 * self.std)} ms² off"
+            )
         if self.name == "truncation":
             share = _rounded(100.0 * self.estimate, 100.0 * self.std)
             return f"{self.where}: {share} % of what refining its elements changes"
@@ -96,6 +103,12 @@ class Calibration:
         """What to do where it is beyond its tolerance."""
         if self.name == "gauge_low_pass" and self.estimate > 0.0:
             return "record them unfiltered, or declare their low-pass as an effect with this corner"
+        if self.name == "gauge_low_pass":
+            return "no low-pass does so: higher modes of the link do, or friction whose law is another"
+        if self.name == "once_per_turn" and self.tolerance and abs(self.estimate) > RARE * self.tolerance:
+            return (
+                f"check how {self.where} is mounted; if it is sound, the model lacks a force: run `sms-online diagnose`"
+            )
         if self.name == "clock" and self.estimate > 0.0:
             return f"state latency = {self.estimate:.2g} for it, or a larger tolerances.clock"
         if self.name == "truncation":
