@@ -82,6 +82,19 @@ def test_what_error_bars_do_not_know_of_is_a_grave_doubt(evidence: Evidence, sai
 
 
 @pytest.mark.parametrize(
+    ("evidence", "step"),
+    [
+        (with_row("joint_1", relative=0.4, whitened=2.1), "a diagnosis has described this system already"),
+        (with_row("joint_1", relative=0.1, whitened=20.0), "check geometry, clocks and stated noise"),
+    ],
+)
+def test_nobody_is_sent_to_a_diagnosis_twice(evidence: Evidence, step: str) -> None:
+    assert "run `sms-online diagnose`" in judge(evidence).next_step
+    assert judge(replace(evidence, diagnosed=True)).next_step.startswith(step)
+    assert "run `sms-online diagnose`" not in judge(replace(evidence, diagnosed=True)).next_step
+
+
+@pytest.mark.parametrize(
     ("evidence", "said"),
     [
         (replace(GOOD, attenuated=("motor_2.mass",)), "noise biases motor_2.mass beyond the error bar"),

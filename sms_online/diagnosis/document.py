@@ -23,7 +23,7 @@ from sms_online.verdict.evidence import Evidence
 from sms_online.verdict.gather import evidence_of
 from sms_online.verdict.judge import at_noise, judge, judge_diagnosis
 from sms_online.verdict.judged import JudgedEvaluation, evaluated
-from sms_online.verdict.reasons import DIAGNOSE, IF_NOTHING, MEASURE_SLOPES, REPLAY_WHOLE, THEN_DIAGNOSE, undecided
+from sms_online.verdict.reasons import MEASURE_SLOPES, REPLAY_WHOLE, undecided, without_diagnosis
 from sms_online.verdict.trust import Reason, Trust
 
 SCHEMA = "sms-online/diagnosis/1"
@@ -135,12 +135,7 @@ def _after(diagnosis: Search, session: JudgedEvaluation) -> Trust:
     trust = session.trust
     if diagnosis.by_rows or diagnosis.of_reconstructed:
         trust = judge(_evidence_after(diagnosis, session))
-    steps = [
-        reason.then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE).removeprefix(IF_NOTHING)
-        for reason in trust.grounds
-    ]
-    grounds = zip(trust.grounds, steps, strict=True)
-    return replace(trust, grounds=tuple(replace(reason, then=step) for reason, step in grounds))
+    return replace(trust, grounds=tuple(replace(each, then=without_diagnosis(each.then)) for each in trust.grounds))
 
 
 def _evidence_after(diagnosis: Search, session: JudgedEvaluation) -> Evidence:

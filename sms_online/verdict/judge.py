@@ -22,9 +22,13 @@ def judge(evidence: Evidence) -> Trust:
     trust = _judged(evidence)
     if not evidence.diagnosed:
         return trust
-    # To send a person back to where the description comes from is no next step.
-    on = [replace(each, then=reasons.DIAGNOSED) if each.then == reasons.DIAGNOSE else each for each in trust.grounds]
-    return replace(trust, grounds=tuple(on))
+    return replace(trust, grounds=tuple(replace(each, then=_behind_diagnosis(each.then)) for each in trust.grounds))
+
+
+def _behind_diagnosis(then: str) -> str:
+    """A next step that does not send a person back to where the description comes from."""
+    instead = reasons.DIAGNOSED if then.endswith(reasons.DIAGNOSE) else ""
+    return reasons.without_diagnosis(then) + instead
 
 
 def _judged(evidence: Evidence) -> Trust:

@@ -63,6 +63,11 @@ NO_KNOWN = "leave `[known]` out, so that joint_1's torque gives the scale, or we
 MOVE = "move all joints, faster and over a larger range, and long enough"
 
 
+def without_diagnosis(then: str) -> str:
+    """A next step less the diagnosis that it asks for."""
+    return then.removesuffix(THEN_DIAGNOSE).removesuffix(DIAGNOSE).removeprefix(IF_NOTHING)
+
+
 def unconverged(why: str) -> Reason:
     """An estimate that will still move by more than its error bars."""
     return Reason(why, False, then=MOVE)
