@@ -15,7 +15,7 @@ import numpy as np
 
 from sms_online.description.channels import concerns, drive_channels
 from sms_online.description.schema import System
-from sms_online.diagnosis.encoder_pairs import EncoderPairs
+from sms_online.diagnosis.agreeing_encoders import AgreeingEncoders
 from sms_online.diagnosis.record import Segment
 from sms_online.diagnosis.rough_fit import SMALLEST, RoughFit, RoughRows, stretches
 from sms_online.diagnosis.sample_mistakes import (
@@ -156,7 +156,7 @@ class _Search:
             found = list(self._scaled(rows, freed))
             if _left(given, PHYSICS) > LEAST_RATIO:
                 every = (*mistake_hypotheses(self.system, self._read), *_gravities(self.system))
-                pairs = EncoderPairs(self._channels, self._segments)
+                pairs = AgreeingEncoders(self._channels, self._segments)
                 likely = self._likely(each for each in every if not pairs.separated(each))
                 found += self._samples(likely, given, PHYSICS, LEAST_RATIO)
         if not found:

@@ -15,8 +15,8 @@ from sms_online.stream import Array
 AGREE, APART = 0.1, 0.3
 
 
-class EncoderPairs:
-    """The pairs of encoders in some samples that agree."""
+class AgreeingEncoders:
+    """The pairs of encoders that agree in some samples."""
 
     def __init__(self, channels: Sequence[str], segments: Sequence[Segment]) -> None:
         self._channels, self._segments = tuple(channels), list(segments)
