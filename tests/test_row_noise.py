@@ -274,6 +274,18 @@ def test_whitening_is_the_dense_cholesky_factor_solved_for() -> None:
     np.testing.assert_allclose(found, np.linalg.solve(np.linalg.cholesky(full), np.concatenate(rows)), rtol=1e-8)
 
 
+def test_a_covariance_that_rounding_leaves_indefinite_is_whitened() -> None:
+    """Two windows that share all their noise but for what is off by 1e-9 of its variance."""
+    covariances = [[np.eye(2)], [(1.0 + 1e-9) * np.eye(2), np.eye(2)]]
+    rows = np.random.default_rng(3).standard_normal((2, 2, 3))
+    whitener = Whitener(3)
+    streamed = [whitener.push(c, row) for c, row in zip(covariances, rows, strict=True)]
+    assert np.isfinite(streamed).all()
+    assert np.isfinite(Whitening(covariances, np.zeros((2, 2))).of(rows)).all()
+    with pytest.raises(np.linalg.LinAlgError):
+        Whitening([[np.eye(2)], [1.1 * np.eye(2), np.eye(2)]], np.zeros((2, 2)))
+
+
 def test_a_capture_is_whitened_like_a_stream() -> None:
     covariances = random_banded(4, 25, seed=9)
     rows = np.random.default_rng(9).standard_normal((25, 4, 3))

@@ -21,7 +21,7 @@ from sms_online.stream import Array
 
 # Shares of a row's variance that are added to it alone: for the rounding of the factorisation, and more where that is
 # too little, as what dry friction makes of noise is a covariance but for the quadrature of its parts.
-ROUNDING = (1e-13, 1e-10, 1e-8, 1e-6)
+ROUNDING, COARSER = 1e-13, (1e-10, 1e-8, 1e-6)
 
 
 class Factor(State):
@@ -54,10 +54,10 @@ class Factor(State):
 
 def _positive(factor: Callable[[float], Array]) -> Array:
     """What `factor` gives of the least share of its variance that makes a matrix positive definite; LinAlgError."""
-    for share in ROUNDING[:-1]:
+    for share in (ROUNDING, *COARSER[:-1]):
         with suppress(np.linalg.LinAlgError):
             return factor(share)
-    return factor(ROUNDING[-1])
+    return factor(COARSER[-1])
 
 
 def forward_solved(L: Array, right: Array) -> Array:
