@@ -13,7 +13,7 @@ import sms_online as sms
 from sms_online.description.parse import parse_system
 from sms_online.stream import Array
 from sms_tools.cli import main
-from sms_tools.exit_codes import BAD_INPUT, NOTHING_DETERMINED
+from sms_tools.exit_codes import BAD_INPUT
 from tests.axis import AXIS, axis_block
 from tests.simulations import planar_capture
 
@@ -175,9 +175,12 @@ def test_a_replay_begins_with_what_is_the_matter(tmp_path: Path, capsys: pytest.
     (tmp_path / "axis.toml").write_text(AXIS + SENSORS)
     sms.write_capture(capture(stuck), tmp_path / "run.csv")
     arguments = ["replay", str(tmp_path / "run.csv"), "--system", str(tmp_path / "axis.toml"), "--out", str(tmp_path)]
-    assert main(arguments) == NOTHING_DETERMINED
+    assert main(arguments) == 0
     assert "check: q_1: stuck at" in capsys.readouterr().err
-    warnings = json.loads((tmp_path / "results.json").read_text())["warnings"]
+    results = json.loads((tmp_path / "results.json").read_text())
+    # What the stuck encoder did to its last windows has ended: the estimate of before holds.
+    assert [event["kind"] for event in results["events"]] == ["transient"]
+    warnings = results["warnings"]
     assert any(warning.startswith("q_1: stuck at") for warning in warnings)
 
 
