@@ -106,9 +106,7 @@ class Calibration:
         if self.name == "gauge_low_pass":
             return "no low-pass does so: higher modes of the link do, or friction whose law is another"
         if self.name == "once_per_turn" and self.tolerance and abs(self.estimate) > RARE * self.tolerance:
-            return (
-                f"check how {self.where} is mounted; if it is sound, the model lacks a force: run `sms-online diagnose`"
-            )
+            return f"check how {self.where} is mounted, for a force may look like it, then run `sms-online diagnose`"
         if self.name == "clock" and self.estimate > 0.0:
             return f"state latency = {self.estimate:.2g} for it, or a larger tolerances.clock"
         if self.name == "truncation":
