@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from sms_adapters.system_file import load_system
-from sms_online.effects.build import build_model
-from sms_online.model.base_parameters import find_base_parameters
-from sms_online.stream import Array, Block
+from sms_online.stream import Block
 from sms_sim.simulate import Simulation
+from tests.campaigns.sessions import true_parameters
 from tests.changed_session import changed_session, noisy
 from tests.evaluated import judged
 from tests.sessions_of import session_of
@@ -27,11 +26,6 @@ def pushed(simulation: Simulation, torque: float, duration: float, at: float = P
     return block
 
 
-def true_values() -> Array:
-    model = build_model(PLANAR)
-    return find_base_parameters(model).values(model.nominal)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("torque", "duration"), [(5.0, 0.3), (40.0, 0.3), (20.0, 1.0)])
 def test_a_push_is_a_transient(planar_session: Simulation, torque: float, duration: float) -> None:
@@ -40,8 +34,8 @@ def test_a_push_is_a_transient(planar_session: Simulation, torque: float, durati
     assert (event.kind, event.parameters, event.sizes) == ("transient", (), ())
     assert abs(event.time - PUSHED) < 0.5
     estimate = estimator.estimate()
-    assert estimate.pi.size == true_values().size
-    assert (np.abs(estimate.pi - true_values()) < 4.0 * estimate.std).all()
+    assert estimate.pi.size == true_parameters(PLANAR).size
+    assert (np.abs(estimate.pi - true_parameters(PLANAR)) < 4.0 * estimate.std).all()
     assert not judged(estimator).grave
 
 

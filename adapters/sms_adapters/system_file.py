@@ -35,9 +35,8 @@ def _text(path_or_name: str) -> str:
     if path.suffix != ".toml":
         names = shipped_systems()
         suggestion = hint(nearest(path_or_name, names))
-        found = "no shipped system of this name"
-        if path.exists() or path.parent != Path():
-            found = "no system file" if path.exists() else "no such file or folder"
+        found = "no such file or folder" if path.parent != Path() else "no shipped system of this name"
+        found = "no system file" if path.exists() else found
         raise InputError(path_or_name, "", found, f"a .toml file or one of {', '.join(names)}{suggestion}")
     try:
         return path.read_bytes().decode("utf-8")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sms_online.diagnosis.record import Segment
-from sms_online.diagnosis.sample_mistakes import MistakeHypothesis
+from sms_online.diagnosis.sample_mistakes import MistakeHypothesis, other_encoder
 from sms_online.stream import Array
 
 # Two encoders agree whose difference moves by less than this share of what they move by: a spring's deflection. They
@@ -20,7 +20,7 @@ class AgreeingEncoders:
 
     def __init__(self, channels: Sequence[str], segments: Sequence[Segment]) -> None:
         self._channels, self._segments = tuple(channels), list(segments)
-        both = [(f"q_{name[8:]}", name) for name in channels if name.startswith("theta_m_")]
+        both = [(other_encoder(name), name) for name in channels if name.startswith("theta_m_")]
         at = [(self._channels.index(q), self._channels.index(theta)) for q, theta in both if q in self._channels]
         values = [each.values for each in segments]
         self._agreeing = [pair for pair in at if _apart(values, pair) < AGREE]

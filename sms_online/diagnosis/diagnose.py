@@ -117,14 +117,14 @@ def diagnose(
         return _drifting(case, followed, drifts, mistakes, zeros)
     late: list[LateSensor] = []
     little = _explains_little(before)
-    while (little or _may_be_late(attempt)) and (found := find_late(attempt.rows, reconstructed)):
+    while (sought := little or _may_be_late(attempt)) and (found := find_late(attempt.rows, reconstructed)):
         progress("taking off a sensor's lag", TRACED)
         late.append(found)
         attempt = Attempt(case, declaring(attempt.system, [found.effect]))
     progress("searching for effects", TRACED)
     chosen = attempt.search()
     if (
-        not (late or chosen or stop())
+        not (sought or late or chosen or stop())
         and _beyond(attempt, chosen)
         and (found := find_late(attempt.rows, reconstructed))
     ):

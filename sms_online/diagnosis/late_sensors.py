@@ -116,6 +116,7 @@ class Lags:
         return self._left[where, corner]
 
     def _predicted(self, where: str | None, corner: float) -> Array:
+        """See `left`."""
         segments = self._segments
         if where is not None:
             # The samples are free of what is declared, latencies of sensors included.

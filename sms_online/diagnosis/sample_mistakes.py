@@ -134,6 +134,11 @@ def _groups(names: Sequence[str]) -> dict[str, list[str]]:
     return grouped((device(name), name) for name in names)
 
 
+def _encoders(channels: Sequence[str]) -> dict[str, list[str]]:
+    """Channels of the encoders of each joint, by its number."""
+    return grouped((name.rpartition("_")[2], name) for name in channels if name.startswith(("q_", "theta_m_")))
+
+
 def _signs(positions: Sequence[str]) -> Iterator[MistakeHypothesis]:
     single = {name: [name] for name in positions if not name.startswith("e")}
     parts = [(*name.rpartition("_"), name) for name in positions]
@@ -210,7 +215,7 @@ def _geared(system: System, channels: Sequence[str]) -> Iterator[MistakeHypothes
 
 def _counts(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     """Encoders of other counts a turn, as quadrature counts twice or four times, or behind another gear."""
-    joints = grouped((name.rpartition("_")[2], name) for name in channels if name.startswith(("q_", "theta_m_")))
+    joints = _encoders(channels)
     single = [[name] for names in joints.values() for name in names]
     for names in (*single, *(names for names in joints.values() if len(names) == 2)):
         where = ", ".join(names)
@@ -248,7 +253,7 @@ def _swaps(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
 
 def _swapped_axes(channels: Sequence[str]) -> Iterator[MistakeHypothesis]:
     """Joints whose encoders are swapped, where each has two, and joints of which all is."""
-    joints = grouped((name.rpartition("_")[2], name) for name in channels if name.startswith(("q_", "theta_m_")))
+    joints = _encoders(channels)
     drives = {name.rpartition("_")[2]: name for name in channels if _is_drive(name)}
     for (i, first), (j, second) in combinations(joints.items(), 2):
         if len(first) != len(second):
@@ -297,18 +302,19 @@ def _wrapped(
 
 def _beside(name: str, positions: Sequence[str]) -> list[str]:
     """The joint's other encoder, or all other readings where it has none."""
-    other = _other_encoder(name)
+    other = other_encoder(name)
     return [other] if other in positions else [each for each in positions if each != name]
 
 
-def _other_encoder(name: str) -> str:
+def other_encoder(name: str) -> str:
+    """The channel of the joint's encoder on the other side of its spring."""
     kind, _, joint = name.rpartition("_")
     return f"theta_m_{joint}" if kind == "q" else f"q_{joint}"
 
 
 def _unwrapped(name: str, turn: float) -> Callable[[tuple[str, ...], Array], Array]:
     """Whole turns that wrapping loses are those of the joint's other encoder."""
-    other, joined = _other_encoder(name), _per_channel([name], lambda column: np.unwrap(column, period=turn))
+    other, joined = other_encoder(name), _per_channel([name], lambda column: np.unwrap(column, period=turn))
 
     def apply(channels: tuple[str, ...], values: Array) -> Array:
         out = joined(channels, values)

@@ -229,7 +229,8 @@ class Changes(Stage):
         if not explanation.explained and late > alarm:
             # What acts may have ended meanwhile.
             at_last = self._rows.explain(whole, base, before, self.behind(late), (onset, alarm), noise).explanation
-            explanation, alarm = (explanation, alarm) if at_last.changed else (at_last, late)
+            if not at_last.changed:
+                return self._unchanged(TRANSIENT, late, start_time)
         if not explanation.changed:
             return self._unchanged(TRANSIENT, alarm, start_time)
         if explanation.jump is not None and explanation.jump.kind == CLOCK:

@@ -188,7 +188,8 @@ def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -
             delta = np.linalg.lstsq(scaled[:, columns], residual, rcond=None)[0]
             rest = residual - scaled[:, columns] @ delta
             ranked.append((float(rest @ rest), jump))
-    cost = alike * COST_OF_A_JUMP + LEAST_SHARE * float(residual @ residual)
+    without = float(residual @ residual)
+    cost = alike * COST_OF_A_JUMP + LEAST_SHARE * without
     ranked.sort(key=lambda entry: round((entry[0] + cost * len(entry[1].columns)) / SAME))
     if not ranked:
         return Explanation(None, np.empty(0), np.empty(0), solve(factor).pi, False, True, True, False)
@@ -199,9 +200,8 @@ def explain(factor: Array, rows: Array, jumps: list[Jump], alike: float = 1.0) -
     fitted = solve(np.column_stack((before, jumped[:, columns], b)))
     std = np.sqrt(alike) * np.linalg.norm(fitted.root, axis=1)
     freedom = M - len(columns)
-    beyond_noise = max(rss - freedom, 0.0) / max(float(residual @ residual) - M, 1.0)
+    beyond_noise = max(rss - freedom, 0.0) / max(without - M, 1.0)
     explained = rss <= _most_of_noise(freedom) or beyond_noise <= UNEXPLAINED
-    without = float(residual @ residual)
     needed, pays = without > _most_of_noise(M), without - rss > cost * len(columns)
     return Explanation(best, fitted.pi[n:], std[n:], fitted.pi[:n], explained, decisive, needed, pays)
 
